@@ -1,4 +1,4 @@
-"""Scenes with batch = true, and many states of them."""
+"""Scenes with batch = true, and batches of their states."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from cases import SCENES, scene_file
 import eomc
 
 STEPS = 60
-UNOPTIMISED = ("cartpole", "kepler_orbit", "mass_spring")  # others tell what optimising changes
+# other scenes are compiled with optimisation
+UNOPTIMISED = ("cartpole", "kepler_orbit", "mass_spring")
 
 
 def module(name: str, **run: str) -> ModuleType:
-    """A scene with batch = true, built under build/ and kept there from test to test."""
+    """Build a scene with batch = true under build/, where later tests find it, and load it."""
     text = (SCENES / f"{name}.toml").read_text(encoding="utf-8")
     options = "".join(f"{k} = {v}\n" for k, v in {"batch": "true", **run}.items())
     many = "_".join(["many", name, *(value.strip('"') for value in run.values())])
@@ -31,6 +32,6 @@ def module(name: str, **run: str) -> ModuleType:
 
 
 def starts(m: ModuleType, count: int) -> tuple[Any, Any]:
-    """`count` states around the scene's start."""
+    """Return `count` states around the initial state of the scene."""
     random = np.random.default_rng(1)
     return tuple(x + 0.2 * random.standard_normal((count, len(x))) for x in m.start)  # type: ignore[return-value]

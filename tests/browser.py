@@ -1,4 +1,4 @@
-"""A headless Chromium, driven by WebDriver over HTTP: what the tests of pages need of it."""
+"""A headless Chromium, controlled by WebDriver over HTTP, for tests of pages."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ _FLAGS = """--headless --no-sandbox --disable-gpu --disable-quic --no-first-run
 
 
 class Page:
-    """A session: one window, with what it logs and asks the network for."""
+    """A session with one window, its console messages and its network requests."""
 
     def __init__(self, root: str, session: str) -> None:
         self.root = f"{root}/session/{session}"
 
-    def call(self, way: str, **given: Any) -> Any:
-        return _post(f"{self.root}/{way}", given)
+    def call(self, command: str, **parameters: Any) -> Any:
+        return _post(f"{self.root}/{command}", parameters)
 
     def open(self, file: Path, width: int = 1000, height: int = 800) -> None:
         self.call("window/rect", width=width, height=height)
@@ -39,7 +39,7 @@ class Page:
         return self.call("execute/sync", script=script, args=list(arguments))
 
     def data(self, name: str) -> str:
-        """What the page tells of itself."""
+        """Return an entry of the page's data set."""
         return self.run("return document.documentElement.dataset[arguments[0]]", name)
 
     def keys(self, text: str) -> None:
@@ -57,40 +57,40 @@ class Page:
         self.call("actions", actions=[{**pointer, "actions": moves}])
 
     def media(self, **features: str) -> None:
-        given = [{"name": n.replace("_", "-"), "value": v} for n, v in features.items()]
-        self.cdp("Emulation.setEmulatedMedia", features=given)
+        media_features = [{"name": n.replace("_", "-"), "value": v} for n, v in features.items()]
+        self.cdp("Emulation.setEmulatedMedia", features=media_features)
 
     def cdp(self, command: str, **params: Any) -> Any:
         return self.call("goog/cdp/execute", cmd=command, params=params)
 
     def logged(self) -> list[str]:
-        """Errors and warnings since the last call."""
+        """Return console errors and warnings since the last call."""
         return [entry["message"] for entry in self.call("se/log", type="browser")]
 
     def requested(self) -> list[str]:
-        """The addresses asked for since the last call."""
-        found = [
+        """Return the addresses requested since the last call."""
+        messages = [
             json.loads(e["message"])["message"] for e in self.call("se/log", type="performance")
         ]
-        asked = "Network.requestWillBeSent"
-        return [m["params"]["request"]["url"] for m in found if m["method"] == asked]
+        method = "Network.requestWillBeSent"
+        return [m["params"]["request"]["url"] for m in messages if m["method"] == method]
 
     def picture(self) -> bytes:
         with urllib.request.urlopen(f"{self.root}/screenshot", timeout=30) as answer:
             return base64.b64decode(json.load(answer)["value"])
 
     def wait(self, script: str, seconds: float = 5.0) -> Any:
-        """The first value of the script that is true."""
+        """Return the first true value of the script."""
         last = time.monotonic() + seconds
-        while not (found := self.run(script)):
+        while not (value := self.run(script)):
             assert time.monotonic() < last, f"not within {seconds:g} s: {script}"
             time.sleep(0.02)
-        return found
+        return value
 
 
 @contextmanager
 def chromium(profile: Path) -> Iterator[Page]:
-    """A window whose traces lie in the folder `profile`."""
+    """Open a window with its profile in the given folder."""
     assert DRIVER and BROWSER
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -99,7 +99,7 @@ def chromium(profile: Path) -> Iterator[Page]:
         [DRIVER, f"--port={port}"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
     root = f"http://127.0.0.1:{port}"
-    wanted = {
+    capabilities = {
         "browserName": "chrome",
         "goog:chromeOptions": {"binary": BROWSER, "args": [*_FLAGS, f"--user-data-dir={profile}"]},
         "goog:loggingPrefs": {"browser": "ALL", "performance": "ALL"},
@@ -107,14 +107,14 @@ def chromium(profile: Path) -> Iterator[Page]:
     try:
         for _ in range(100):
             try:
-                made = _post(f"{root}/session", {"capabilities": {"alwaysMatch": wanted}})
+                session = _post(f"{root}/session", {"capabilities": {"alwaysMatch": capabilities}})
                 break
             except ConnectionError:
                 time.sleep(0.1)
             except urllib.error.URLError as fault:
                 assert isinstance(fault.reason, ConnectionError), fault
                 time.sleep(0.1)
-        page = Page(root, made["sessionId"])
+        page = Page(root, session["sessionId"])
         yield page
         urllib.request.urlopen(urllib.request.Request(page.root, method="DELETE"), timeout=30)
     finally:
@@ -122,9 +122,9 @@ def chromium(profile: Path) -> Iterator[Page]:
         driver.wait(30)
 
 
-def _post(address: str, given: Any) -> Any:
+def _post(address: str, data: Any) -> Any:
     request = urllib.request.Request(
-        address, json.dumps(given).encode(), {"Content-Type": "application/json"}
+        address, json.dumps(data).encode(), {"Content-Type": "application/json"}
     )
     try:
         with urllib.request.urlopen(request, timeout=60) as answer:

@@ -1,4 +1,4 @@
-"""Builds as tests of the toolchain make them: a pendulum to change, a folder, shell scripts."""
+"""Builds in tests of the toolchain: a pendulum to change, a build folder, shell scripts."""
 
 from __future__ import annotations
 
@@ -24,15 +24,16 @@ if TYPE_CHECKING:
     from eomc.emit.render import Sources
     from eomc.model.system import System
 
-KEPT = SCENES.parent / "build" / "tests" / "kept"  # builds to be copied, from run to run
+# builds that tests copy, reused in later sessions
+REUSED_BUILDS = SCENES.parent / "build" / "tests" / "kept"
 TEXT = (SCENES / "simple_pendulum.toml").read_text(encoding="utf-8")
-FRESH = 10  # what a process that builds returns, and one less where it was there already
+FRESH = 10  # exit status of a process that builds; one less if the build exists already
 CHANGED = TEXT.replace('"m*g*y"', '"2*m*g*y"')
 
 
 @pytest.fixture(scope="module")
 def unoptimised_file() -> Iterator[None]:
-    """`quickly_compiled` for a whole file of tests, with what its own fixtures build."""
+    """`quickly_compiled` for all tests and fixtures of a file."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("EOMC_CFLAGS", "-O0")
         patch.delenv("CC", raising=False)
@@ -41,28 +42,28 @@ def unoptimised_file() -> Iterator[None]:
 
 @pytest.fixture
 def quickly_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For modules that few tests use: optimising them would take longer than running them.
+    """Compile without optimisation modules that few tests use, because it would take longer.
 
-    Not for scenes of other files in MODULES, which would be built in turns with other flags.
+    Not for scenes of other files in MODULES, which would be built alternately with different flags.
     """
     monkeypatch.setenv("EOMC_CFLAGS", "-O0")
     monkeypatch.delenv("CC", raising=False)
 
 
-_made: dict[tuple[str, str, str], Sources] = {}
+_sources: dict[tuple[str, str, str], Sources] = {}
 
 
 def _sources_once(system: System, extension: str, **how: Any) -> Sources:
-    """The files of a pendulum: what tests of builds change is where they go, and its text."""
+    """Return the files of a pendulum, derived once for each text and extension."""
     key = (system.digest, Path(system.file).name, extension)
-    if key not in _made:
-        _made[key] = eomc.sources(system, extension, **how)
-    return _made[key]
+    if key not in _sources:
+        _sources[key] = eomc.sources(system, extension, **how)
+    return _sources[key]
 
 
 @pytest.fixture
 def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A scene file that a test may change; of one text `eomc.build` derives the C once."""
+    """A scene file that a test may change; `eomc.build` derives each text once."""
     monkeypatch.setattr(pipeline, "sources", _sources_once)
     file = tmp_path / "simple_pendulum.toml"
     file.write_text(TEXT, encoding="utf-8")
@@ -80,38 +81,38 @@ def pendulum() -> tuple[Path, float]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("EOMC_CFLAGS", "-O0")
         patch.delenv("CC", raising=False)
-        folder = eomc.build(SCENES / "simple_pendulum.toml", KEPT).folder
-    return folder, gravity(KEPT)
+        folder = eomc.build(SCENES / "simple_pendulum.toml", REUSED_BUILDS).folder
+    return folder, gravity(REUSED_BUILDS)
 
 
 @pytest.fixture
-def found(root: Path, pendulum: tuple[Path, float]) -> None:
-    """A good build of the scene is there already."""
+def existing_build(root: Path, pendulum: tuple[Path, float]) -> None:
+    """A valid build of the scene exists."""
     shutil.copytree(pendulum[0], root / "simple_pendulum")
 
 
 @pytest.fixture
-def built(scene: Path, found: None, pendulum: tuple[Path, float]) -> float:
-    """A good build; its gravity. The scene is then changed, so that another build is due."""
+def built(scene: Path, existing_build: None, pendulum: tuple[Path, float]) -> float:
+    """A valid build and its gravity. The scene has changed since, so that a new build is needed."""
     scene.write_text(CHANGED, encoding="utf-8")
     return pendulum[1]
 
 
 def script(file: Path, text: str) -> str:
-    """An executable shell script; its path."""
+    """Write an executable shell script; return its path."""
     file.write_text("#!/bin/sh\n" + text, encoding="utf-8")
     file.chmod(file.stat().st_mode | stat.S_IXUSR)
     return str(file)
 
 
 def gravity(root: Path) -> float:
-    """g(1 rad) of the module that lies there, as a process imports it that had none."""
+    """Return g(1 rad) of the module in the folder, imported by a new process."""
 
     def ask() -> float:
         sys.path.insert(0, str(root))
         for name in [m for m in sys.modules if m.split(".")[0] == "simple_pendulum"]:
             del sys.modules[name]
-        importlib.invalidate_caches()  # listed by the parent, in the same tick of the clock
+        importlib.invalidate_caches()  # the parent has listed it within the same tick of the clock
         return float(importlib.import_module("simple_pendulum").g([1.0])[0])
 
     how, value = in_a_fork(ask, 20)
@@ -120,13 +121,13 @@ def gravity(root: Path) -> float:
 
 
 def leftovers(root: Path) -> list[str]:
-    """Whatever stands beside the module and its lock."""
+    """Return the files besides the module and its lock."""
     expected = {"simple_pendulum", ".simple_pendulum.lock"}
     return sorted(f.name for f in root.iterdir() if f.name not in expected)
 
 
-def started(scene: Path, root: Path, **environment: str) -> ForkProcess:
-    """A process that builds, and has SymPy already."""
+def start_build(scene: Path, root: Path, **environment: str) -> ForkProcess:
+    """Start a process that builds; SymPy is imported already."""
 
     def build() -> None:
         os.environ.update(environment)
@@ -137,8 +138,10 @@ def started(scene: Path, root: Path, **environment: str) -> ForkProcess:
     return process
 
 
-def marks(folder: Path) -> dict[str, tuple[int, int, int]]:
-    """What tells whether a file was touched, by name."""
+def file_states(folder: Path) -> dict[str, tuple[int, int, int]]:
+    """Return inode, modification time and size of each file by name, which show whether it
+    changed.
+    """
     return {
         f.name: (f.stat().st_ino, f.stat().st_mtime_ns, f.stat().st_size)
         for f in folder.iterdir()

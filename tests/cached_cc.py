@@ -1,4 +1,4 @@
-"""A C compiler that remembers what it was given before, in the folder $EOMC_KEPT."""
+"""A C compiler that stores its results in the folder $EOMC_KEPT and reuses them."""
 
 import glob
 import hashlib
@@ -7,22 +7,22 @@ import shutil
 import subprocess
 import sys
 
-given = sys.argv[1:]
-out = given[given.index("-o") + 1] if "-o" in given else ""
-total = hashlib.sha256(repr([x for x in given if x != out]).encode())
-folders = {os.path.dirname(x) or "." for x in given if x.endswith(".c")}
+arguments = sys.argv[1:]
+out = arguments[arguments.index("-o") + 1] if "-o" in arguments else ""
+total = hashlib.sha256(repr([x for x in arguments if x != out]).encode())
+folders = {os.path.dirname(x) or "." for x in arguments if x.endswith(".c")}
 headers = [header for folder in sorted(folders) for header in sorted(glob.glob(f"{folder}/*.h"))]
-for name in (*given, *headers):
+for name in (*arguments, *headers):
     if name != out and os.path.isfile(name):
         with open(name, "rb") as file:
             total.update(file.read())
-kept = os.path.join(os.environ["EOMC_KEPT"], total.hexdigest())
-if out and os.path.exists(kept):
-    shutil.copy(kept, out)
+stored = os.path.join(os.environ["EOMC_KEPT"], total.hexdigest())
+if out and os.path.exists(stored):
+    shutil.copy(stored, out)
     sys.exit(0)
-done = subprocess.run(["cc", *given])
-if done.returncode == 0 and out and os.path.isfile(out):
+process = subprocess.run(["cc", *arguments])
+if process.returncode == 0 and out and os.path.isfile(out):
     os.makedirs(os.environ["EOMC_KEPT"], exist_ok=True)
-    shutil.copy(out, f"{kept}.{os.getpid()}")
-    os.rename(f"{kept}.{os.getpid()}", kept)
-sys.exit(done.returncode)
+    shutil.copy(out, f"{stored}.{os.getpid()}")
+    os.rename(f"{stored}.{os.getpid()}", stored)
+sys.exit(process.returncode)

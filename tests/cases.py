@@ -1,4 +1,4 @@
-"""The cases with trusted answers in data/cases.json, as scenes."""
+"""The cases with reference solutions in data/cases.json, as scenes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from eomc.scene.read import parse, read
 DATA = Path(__file__).parent / "data" / "cases.json"
 SCENES = Path(__file__).parent.parent / "scenes"
 
-# the scenes and the cases that have the same physics and the same start
+# Scenes and the cases with the same equations and initial state.
 ALIKE = {
     "mass_spring": "harmonic_1e6_periods",
     "cartpole": "cartpole_drop_physicalP",
@@ -43,7 +43,7 @@ ALIKE = {
 
 FMA = "fma" in Path("/proc/cpuinfo").read_text(encoding="utf-8")  # of this processor
 
-# angles that are sums of coordinates and numbers, and one that is none
+# Angles that are sums of coordinates and numbers, and one that is not.
 ODD = """
 eomc = 1
 name = "odd"
@@ -62,34 +62,34 @@ def odd_system() -> System:
     return from_scene(parse(ODD, "odd.toml"))
 
 
-# of these the quick tier looks at
+# scenes that the quick tier compares
 FEW_ALIKE = (
     "mass_spring", "cartpole_driven", "kapitza_pendulum", "foucault_pendulum", "heavy_top",
 )  # fmt: skip
 
 
-def fast_kit(made: Sources) -> dict[str, str]:
-    """The generated files, the fast form's header and source in the place of the plain ones."""
-    flat = {f: text for f, text in made.files.items() if "/" not in f}
-    fast = {f[5:]: text for f, text in made.files.items() if f.startswith("fast/")}
+def fast_kit(sources: Sources) -> dict[str, str]:
+    """Return the generated files, with header and source of optimised C in place of portable C."""
+    flat = {f: text for f, text in sources.files.items() if "/" not in f}
+    fast = {f[5:]: text for f, text in sources.files.items() if f.startswith("fast/")}
     return flat | fast
 
 
 def fast_files(module: ModuleType) -> dict[str, str]:
-    """As `fast_kit`, of a module's folder."""
+    """Return the files of a module's folder like `fast_kit`."""
     folder = Path(str(module.__file__)).parent
-    found = (*folder.glob("*.[ch]"), *(folder / "fast").glob("*.[ch]"))
-    return {file.name: file.read_text(encoding="utf-8") for file in found}
+    files = (*folder.glob("*.[ch]"), *(folder / "fast").glob("*.[ch]"))
+    return {file.name: file.read_text(encoding="utf-8") for file in files}
 
 
 @cache
 def cases() -> dict[str, dict[str, Any]]:
-    """The cases by name; the file's own \"contract\" says what their keys mean."""
+    """Return the cases by name; "contract" in the file explains their keys."""
     return {case["name"]: case for case in json.loads(DATA.read_text())["cases"]}
 
 
 def scene_text(name: str) -> str:
-    """A case as the text of a scene; parameters that C can't bear get names that it can."""
+    """Return a case as the text of a scene; parameters with names reserved in C are renamed."""
     case = cases()[name]
     if case["constraints"]:
         raise ValueError(f"{name} has constraints, which scenes can't say")
@@ -121,23 +121,23 @@ def scene_text(name: str) -> str:
 
 @cache
 def case_system(name: str) -> System:
-    """A case as a System, with the coarsest measured step size and t_end as its run."""
+    """Return a case as a System, with the largest measured step size and t_end as its run."""
     return from_scene(parse(scene_text(name), f"{name}.toml"))
 
 
 @cache
 def scene_system(name: str) -> System:
-    """The System of scenes/<name>.toml."""
+    """Return the System of scenes/<name>.toml."""
     return from_scene(read(SCENES / f"{name}.toml"))
 
 
 def error_of(name: str, q: Any) -> float:
-    """max_i |q_i - q_ref_i| at t_end."""
+    """Return max_i |q_i - q_ref_i| at t_end."""
     return float(np.max(np.abs(np.asarray(q) - np.array(cases()[name]["q_ref"], float))))
 
 
 def scene_file(name: str, text: str) -> Path:
-    """Where the text of a scene lies now."""
+    """Write the text of a scene to a file; return its path."""
     path = Path("build/tests") / f"{name}.toml"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text, encoding="utf-8")
@@ -145,7 +145,7 @@ def scene_file(name: str, text: str) -> Path:
 
 
 def variant(scene: str, name: str, **replaced: str) -> Path:
-    """A scene of scenes/ under another name, with lines more under [run]."""
+    """Write a scene of scenes/ with another name and with lines added under [run]."""
     text = (SCENES / f"{scene}.toml").read_text(encoding="utf-8")
     lines = "\n".join(f"{key} = {value}" for key, value in replaced.items())
     old = next(line for line in text.splitlines() if line.startswith("name "))
@@ -154,7 +154,7 @@ def variant(scene: str, name: str, **replaced: str) -> Path:
 
 
 def block_at_rest(block: Any, tol: float) -> Any:
-    """The run of a block on a spring with dry friction, which goes and ends as it should."""
+    """Return the run of a block on a spring with dry friction, which must stop as expected."""
     case = cases()["coulomb_friction"]
     run = block.simulate(tol=tol, duration=6.0)
     assert run.status == "ok" and run.steps + run.rejected < 50

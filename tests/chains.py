@@ -1,4 +1,4 @@
-"""Random closed chains of bars in the plane, some with a bar more that says nothing new."""
+"""Random closed planar chains of bars, some with a redundant bar."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from eomc.model.from_scene import from_scene
 from eomc.model.system import System
 from eomc.scene.read import parse
 
-ROUGH = 0.2  # of a value, a guess may be off
+ROUGH = 0.2  # largest deviation of a guess
 
 
 @dataclass(frozen=True)
 class Chain:
-    """A chain of bars from one fixed pin to another; q: angles at which it is closed.
+    """A chain of bars between two fixed pins; q: angles at which it is closed.
 
-    held: which of them a start holds; extra: rows that others imply.
+    fixed: which of them are fixed initial values; extra: number of redundant constraints.
     """
 
     system: System
     q: np.ndarray
-    held: np.ndarray
+    fixed: np.ndarray
     extra: int
 
 
 def chain(seed: int, rough: float = ROUGH) -> Chain:
-    """A chain of 4 to 12 bars, the fixed one among them, with random lengths, masses and points.
+    """Return a chain of 4 to 12 bars, including the ground, with random lengths, masses and points.
 
-    Absolute angles; the last bar's end is at a random point of the bar. Every third has a bar more
-    between two bars that a parallelogram holds parallel, which is redundant.
+    Angles are absolute; the end of the last bar is at a random point of the bar. Every third chain
+    has a redundant bar between two bars that a parallelogram makes parallel.
     """
     random = np.random.default_rng(seed)
     bars = int(random.integers(4, 13))
@@ -38,17 +38,17 @@ def chain(seed: int, rough: float = ROUGH) -> Chain:
     length, mass = random.uniform(0.3, 1.5, n), random.uniform(0.2, 3.0, n)
     q = random.uniform(-np.pi, np.pi, n)
     ends = length.copy()
-    ends[-1] *= random.uniform(0.4, 1.0)  # where the last bar is pinned
+    ends[-1] *= random.uniform(0.4, 1.0)  # the last bar is pinned there
     pin = np.array([ends @ np.cos(q), ends @ np.sin(q)])
-    held = np.zeros(n, dtype=bool)
-    held[random.permutation(n)[: n - 2]] = True
-    off = np.where(held, 0, random.uniform(-rough, rough, n))
+    fixed = np.zeros(n, dtype=bool)
+    fixed[random.permutation(n)[: n - 2]] = True
+    off = np.where(fixed, 0, random.uniform(-rough, rough, n))
     guess = q * (1 + off)
     x = " + ".join(f"{ends[k]!r}*cos(q{k})" for k in range(n))
     y = " + ".join(f"{ends[k]!r}*sin(q{k})" for k in range(n))
     rows = [f'x = "{x} - ({pin[0]!r})"', f'y = "{y} - ({pin[1]!r})"']
     extra = 0
-    if seed % 3 == 0:  # what is pinned already is pinned once more, from elsewhere
+    if seed % 3 == 0:  # a redundant bar between two points
         factors = random.uniform(-2, 2, 2)
         rows.append(f'again = "{factors[0]!r}*({x} - ({pin[0]!r})) + sin({y} - ({pin[1]!r}))"')
         extra = 1
@@ -64,7 +64,7 @@ def chain(seed: int, rough: float = ROUGH) -> Chain:
         )
         potential.append(f"{mass[k] * 9.81!r}*({cy})")
     starts = "\n".join(
-        f"q{k} = {{ start = {float(guess[k])!r}, guess = {str(not held[k]).lower()} }}"
+        f"q{k} = {{ start = {float(guess[k])!r}, guess = {str(not fixed[k]).lower()} }}"
         for k in range(n)
     )
     text = f"""
@@ -80,4 +80,4 @@ potential = "{" + ".join(potential)}"
 [run]
 duration = 1.0
 """
-    return Chain(from_scene(parse(text.replace("np.float64", ""), "chain.toml")), q, held, extra)
+    return Chain(from_scene(parse(text.replace("np.float64", ""), "chain.toml")), q, fixed, extra)

@@ -1,6 +1,6 @@
-"""Small changes of a source, each of one place: of C, of templates that write C, of Python.
+"""Small changes of a source, each in one place: of C, of templates, of Python.
 
-What is changed is a sign, an operator, a comparison, a factor, a constant, an index, a condition, a
+A change concerns a sign, an operator, a comparison, a factor, a constant, an index, a condition, a
 loop, a returned value or a whole statement.
 """
 
@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-# what is found, and what it may become
+# a pattern, and its replacements
 CHANGES: Sequence[tuple[str, Sequence[str]]] = (
     (r"(?<=[\w)\]]) \+ (?=[\w(-])", (" - ", " * ")),
     (r"(?<=[\w)\]]) - (?=[\w(])", (" + ",)),
@@ -48,26 +48,26 @@ class Mutant:
     end: int
     new: str
 
-    def of(self, source: str) -> str:
-        """The changed source."""
+    def apply(self, source: str) -> str:
+        """Return the changed source."""
         return source[: self.at] + self.new + source[self.end :]
 
 
 def of_c(source: str) -> list[Mutant]:
-    """All of them, in the code alone: no comments, no #if, no prototypes, no declared sizes."""
+    """Return all mutants of the code, without comments, #if, prototypes and declared sizes."""
     return _of_lines(_code(source))
 
 
 def _of_lines(lines: Iterable[tuple[int, str]]) -> list[Mutant]:
-    found = []
+    mutants = []
     for start, line in lines:
         for pattern, changes in CHANGES:
             for match in re.finditer(pattern, line):
                 for change in changes:
                     new = _changed(match[0], change)
                     if new != match[0]:
-                        found.append(Mutant(start + match.start(), start + match.end(), new))
-    return found
+                        mutants.append(Mutant(start + match.start(), start + match.end(), new))
+    return mutants
 
 
 def _changed(old: str, change: str) -> str:
@@ -81,12 +81,12 @@ def _changed(old: str, change: str) -> str:
 
 
 def _code(source: str) -> Iterator[tuple[int, str]]:
-    """Lines inside functions, comments blanked, each with its place."""
+    """Yield lines inside functions, with blanked comments, and their positions."""
     blank = re.sub(r"/\*.*?\*/", lambda m: re.sub(r"[^\n]", " ", m[0]), source, flags=re.S)
     inside, at, skipped, depth = False, 0, False, 0
     for line in blank.splitlines(keepends=True):
         if line.startswith("#"):
-            # what is left out for this compiler
+            # code that this compiler skips
             if line.startswith(("#if", "#ifdef", "#ifndef")):
                 depth += 1
             elif line.startswith("#endif"):
@@ -101,7 +101,7 @@ def _code(source: str) -> Iterator[tuple[int, str]]:
         at += len(line)
 
 
-# --- templates, and C that is written by hand -----------------------------------------------------
+# --- templates and handwritten C ------------------------------------------------------------------
 
 TAG = re.compile(r"{[{%#].*?[}%#]}", re.S)
 CONDITION = re.compile(r"{%-? *(?:el)?if (.*?) *-?%}")
@@ -111,7 +111,9 @@ STATEMENT = re.compile(
 
 
 def of_template(source: str) -> list[Mutant]:
-    """All of them, in what the template writes and in its conditions, and statements left out."""
+    """Return all mutants of what the template writes and of its conditions, and removed
+    statements.
+    """
     bare = TAG.sub(lambda m: re.sub(r"[^\n]", "\0", m[0]), source)
     bare = re.sub(r"/\*.*?\*/", lambda m: re.sub(r"[^\n]", "\0", m[0]), bare, flags=re.S)
     lines, at = [], 0
@@ -119,17 +121,17 @@ def of_template(source: str) -> list[Mutant]:
         if not line.startswith("#"):
             lines.append((at, line))
         at += len(line)
-    found = _of_lines(lines)
+    mutants = _of_lines(lines)
     for match in STATEMENT.finditer(source):
         if bare[match.start() : match.end()].strip("\0 "):
-            found.append(Mutant(match.start(), match.end(), ""))
+            mutants.append(Mutant(match.start(), match.end(), ""))
     for match in CONDITION.finditer(source):
-        found.append(Mutant(*match.span(1), f"not ({match[1]})"))
+        mutants.append(Mutant(*match.span(1), f"not ({match[1]})"))
         for here in re.finditer(r" (and|or) ", match[1]):
             other = " or " if here[1] == "and" else " and "
             start = match.start(1)
-            found.append(Mutant(start + here.start(), start + here.end(), other))
-    return found
+            mutants.append(Mutant(start + here.start(), start + here.end(), other))
+    return mutants
 
 
 # --- Python ---------------------------------------------------------------------------------------
@@ -149,7 +151,7 @@ FUNCTIONS = {"min": "max", "max": "min", "any": "all", "all": "any", "sorted": "
 
 
 def of_python(source: str) -> list[Mutant]:
-    """All of them, but for types, imports, docstrings and texts."""
+    """Return all mutants, except of types, imports, docstrings and messages."""
     return _Python(source).found
 
 
@@ -163,7 +165,7 @@ class _Python(ast.NodeVisitor):
         self.visit(ast.parse(source))
 
     def place(self, line: int, column: int) -> int:
-        """A place in characters; ast counts bytes."""
+        """Return a position in characters; ast counts bytes."""
         return self.starts[line - 1] + len(self.lines[line - 1].encode()[:column].decode())
 
     def span(self, node: ast.AST) -> tuple[int, int]:
@@ -177,19 +179,19 @@ class _Python(ast.NodeVisitor):
         return self.source[start:end]
 
     def put(self, node: ast.AST, new: str) -> None:
-        """In place of the whole node."""
+        """Replace the whole node."""
         self.found.append(Mutant(*self.span(node), new))
 
     def between(self, left: ast.AST, right: ast.AST, old: str, new: str) -> None:
-        """An operator."""
+        """Replace an operator."""
         start, end = self.span(left)[1], self.span(right)[0]
         at = self.source.index(old, start, end)
         self.found.append(Mutant(at, at + len(old), new))
 
-    # --- what is passed over
+    # --- skipped nodes -----
 
     def visit_arg(self, node: ast.arg) -> None:
-        """Its type."""
+        """Skip its type."""
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> None:
         if node.value:
@@ -212,7 +214,7 @@ class _Python(ast.NodeVisitor):
             self.visit(part)
 
     def visit_keyword(self, node: ast.keyword) -> None:
-        if node.arg != "strict":  # which says what holds
+        if node.arg != "strict":  # an assertion
             self.visit(node.value)
 
     def visit_If(self, node: ast.If) -> None:
@@ -220,7 +222,7 @@ class _Python(ast.NodeVisitor):
             self.put(node.test, f"not ({self.text(node.test)})")
             self.generic_visit(node)
 
-    # --- what is changed
+    # --- changed nodes -
 
     def visit_IfExp(self, node: ast.IfExp) -> None:
         self.put(node.test, f"(not ({self.text(node.test)}))")
@@ -275,7 +277,7 @@ class _Python(ast.NodeVisitor):
             self.put(node, repr(node.value * 1.5 if node.value else 1.0))
 
     def visit_JoinedStr(self, node: ast.JoinedStr) -> None:
-        """Its places are not told before Python 3.12."""
+        """Skip it: its positions are not known before Python 3.12."""
 
     def visit_Call(self, node: ast.Call) -> None:
         if isinstance(node.func, ast.Name) and node.func.id in FUNCTIONS:
@@ -298,7 +300,7 @@ class _Python(ast.NodeVisitor):
         self.generic_visit(node)
 
     def visit_Assert(self, node: ast.Assert) -> None:
-        """It says what holds, and stays."""
+        """Skip assertions."""
 
     def visit_Return(self, node: ast.Return) -> None:
         if node.value is not None and not isinstance(node.value, ast.Constant):

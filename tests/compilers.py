@@ -1,4 +1,4 @@
-"""C compilers as tests call them."""
+"""Calls of C compilers in tests."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ def run(*command: str, cwd: Path) -> subprocess.CompletedProcess[str]:
 
 
 def compiled(*command: str, cwd: Path) -> None:
-    """Without a word from the compiler."""
-    done = run(*command, cwd=cwd)
-    assert (done.returncode, done.stdout + done.stderr) == (0, "")
+    """Run a compiler, which must issue no messages."""
+    process = run(*command, cwd=cwd)
+    assert (process.returncode, process.stdout + process.stderr) == (0, "")
 
 
 def clang(cpp: bool = False) -> list[str]:
-    """The command of clang, or of the one in ziglang; a test is skipped where neither is there."""
+    """Return the command of clang, or of ziglang's; skip the test if neither is installed."""
     if path := shutil.which("clang++" if cpp else "clang"):
         return [path]
     if importlib.util.find_spec("ziglang") is None:

@@ -1,4 +1,4 @@
-"""What several test files share: scenes compiled once, scenes from text, the C compilers here."""
+"""Fixtures that several test files share: scenes compiled once, scenes from text, C compilers."""
 
 from __future__ import annotations
 
@@ -36,20 +36,20 @@ if TYPE_CHECKING:
     from eomc.verify.reference import ReferenceModel, Vector
     from eomc.verify.sampling import SampleBudget
 
-# in a shell's background Ctrl-C is switched off, and tests of it would wait for ever
+# Background jobs of a shell ignore SIGINT, and tests of Ctrl-C would never end.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 pytest_plugins = ["builds"]
 
-gc.set_threshold(100_000, 20, 100)  # SymPy makes many values and few cycles
+gc.set_threshold(100_000, 20, 100)  # SymPy creates many objects and few cycles
 
 ROOT = Path(__file__).parent.parent
 os.environ.setdefault("HYPOTHESIS_STORAGE_DIRECTORY", str(ROOT / "build" / ".hypothesis"))
-# how long a busy machine takes to think of inputs is no fault of what they are given to
+# Slow generation of inputs on a busy machine is no error of the tested code.
 settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("busy")
-# what is copied beside each built module is the same in all of them: compiled once
+# Runtime files are identical in all built modules: compile them to bytecode once.
 _get_code = SourceFileLoader.get_code
 _codes: dict[bytes, CodeType] = {}
 
@@ -68,11 +68,11 @@ SourceFileLoader.get_code = _code_once  # type: ignore[method-assign]
 
 
 def _binding_flags() -> tuple[str, ...]:
-    """The calls' own speed is no matter, and they are compiled in half of the time."""
-    given = compiler.user_flags()
-    if os.environ.get("CC") or (given is not None and given != ("-O0",)):
-        return given or ("-O0",)
-    return ("-O0", *precompiled.included())
+    """Compile the binding without optimisation, in half the time; its speed does not matter."""
+    flags = compiler.user_flags()
+    if os.environ.get("CC") or (flags is not None and flags != ("-O0",)):
+        return flags or ("-O0",)
+    return ("-O0", *precompiled.precompiled_header_flags())
 
 
 extension.binding_flags = _binding_flags
@@ -81,62 +81,63 @@ _libraries: dict[str, bytes] = {}
 
 
 def _build_once(
-    made: Sources, name: str, folder: Path, library: str, by: Compiler, *how: Any
+    sources: Sources, name: str, folder: Path, library: str, by: Compiler, *how: Any
 ) -> None:
-    """The same C by the same compiler, unless a test asks for one, gives what it gave before."""
+    """Reuse the result for the same C and compiler, unless a test sets one."""
     if os.environ.get("CC"):
-        _build(made, name, folder, library, by, *how)
+        _build(sources, name, folder, library, by, *how)
         return
     if len(how) == 1 and compiler.user_flags() == ("-O0",):
         how = (*how, precompiled.UNOPTIMISED)
-    parts = (made.files, made.cdef, name, library, by, how, compiler.user_flags())
+    parts = (sources.files, sources.cdef, name, library, by, how, compiler.user_flags())
     key = hashlib.sha256(repr(parts).encode()).hexdigest()
     if key in _libraries:
         (folder / library).write_bytes(_libraries[key])
         return
-    _build(made, name, folder, library, by, *how)
+    _build(sources, name, folder, library, by, *how)
     _libraries[key] = (folder / library).read_bytes()
 
 
 def _link(name: str, folder: Path, *commands: Sequence[str]) -> None:
-    """What starts a program is not in a library that Python loads; left out, it is found sooner."""
+    """Omit startup files when linking a library that Python loads; this saves time."""
     if not os.environ.get("CC"):
         for words in commands:
             if words[-3].endswith("binding.c") and words[-1] == "binding.o" and "-O0" in words:
                 file = folder / words[-3]
-                file.write_text(precompiled.shortened(file.read_text("utf-8")), "utf-8")
+                file.write_text(precompiled.shorten_binding(file.read_text("utf-8")), "utf-8")
     plain = os.environ.get("CC") or sys.platform != "linux" or "-shared" not in commands[0]
     _run(name, folder, *commands if plain else [[*commands[0], "-nostdlib"]])
 
 
 def _trial(*what: Any) -> None:
-    """What the compiler here makes is loaded right after; that of others is tried before."""
+    """Skip the trial for the default compiler, because its library is loaded next."""
     if os.environ.get("CC"):
         _try(*what)
 
 
 extension.build, extension.run, extension.try_load = _build_once, _link, _trial
 
-_ahead = Sampler._predicted_ranges
-_seen: dict[tuple[int, SampleBudget], tuple[ReferenceModel, Vector]] = {}
+_original_ranges = Sampler._predicted_ranges
+_cached_ranges: dict[tuple[int, SampleBudget], tuple[ReferenceModel, Vector]] = {}
 
 
-def _ahead_once(sampler: Sampler, effort: SampleBudget) -> Vector:
-    """How far a reference gets by itself; it takes most of the time of drawing a few states."""
+def _predicted_ranges_once(sampler: Sampler, effort: SampleBudget) -> Vector:
+    """Cache the predicted ranges, which take most of the time of drawing a few states."""
     key = (id(sampler.reference), effort)
-    if key not in _seen:
-        _seen[key] = (sampler.reference, _ahead(sampler, effort))  # which keeps the id, too
-    return _seen[key][1]
+    if key not in _cached_ranges:
+        # The stored reference keeps its id valid.
+        _cached_ranges[key] = (sampler.reference, _original_ranges(sampler, effort))
+    return _cached_ranges[key][1]
 
 
-Sampler._predicted_ranges = _ahead_once  # type: ignore[method-assign]
+Sampler._predicted_ranges = _predicted_ranges_once  # type: ignore[method-assign]
 
-# kept from one run of the tests to the next
+# reused in later sessions
 MODULES = ROOT / "build" / "tests" / "modules"
 UNOPTIMISED = ROOT / "build" / "tests" / "unoptimised"
 
-# Every function of the formula language, an explicit time, friction, a part of K without
-# velocities, an input that hangs on the state, and names that C and Python would like to keep.
+# Every function of the formula language, explicit time, friction, a part of K without velocities,
+# an input that depends on the state, and names that are awkward in C and Python.
 EVERYTHING = """
 eomc = 1
 name = "everything"
@@ -194,36 +195,38 @@ def _loaded(name: str) -> ModuleType:
 
 
 @cache
-def _made(made: System, optimised: bool) -> ModuleType:
-    """In a folder of its own: tests may give two scenes one name."""
+def _compiled_system(system: System, optimised: bool) -> ModuleType:
+    """Build in a folder of its own, because tests may give two scenes the same name."""
     root, flags = (MODULES, None) if optimised else (UNOPTIMISED, "-O0")
-    return _compiled(made, root / made.digest[:16], flags)
+    return _compiled(system, root / system.digest[:16], flags)
 
 
-def _compiled(made: Path | System, root: Path, flags: str | None) -> ModuleType:
-    """With these flags, or as it is usually, whatever a test has set for modules of its own."""
+def _compiled(source: Path | System, root: Path, flags: str | None) -> ModuleType:
+    """Build with these flags, or the default ones, regardless of the flags that a test has set."""
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("EOMC_CFLAGS", raising=False)
         if flags is not None:
             patch.setenv("EOMC_CFLAGS", flags)
-        return eomc.load(made, root)
+        return eomc.load(source, root)
 
 
 class Modules:
-    """Compiled scenes, each built once in a session and found again by the next."""
+    """Compiled scenes, each built once per session and reused by the next session."""
 
     def __call__(self, name: str) -> ModuleType:
-        """The module of scenes/<name>.toml."""
+        """Return the module of scenes/<name>.toml."""
         return _loaded(name)
 
     def of_text(self, text: str) -> ModuleType:
-        """The module of a scene given as text."""
-        return _made(from_scene(parse(text, "test.toml")), True)
+        """Return the module of a scene given as text."""
+        return _compiled_system(from_scene(parse(text, "test.toml")), True)
 
-    def unoptimised(self, made: str | System) -> ModuleType:
-        """The module of a text or a system, where speed is no matter: compiled in half the time."""
-        system = from_scene(parse(made, "test.toml")) if isinstance(made, str) else made
-        return _made(system, False)
+    def unoptimised(self, source: str | System) -> ModuleType:
+        """Return the module of a text or a system, compiled without optimisation in half the
+        time.
+        """
+        system = from_scene(parse(source, "test.toml")) if isinstance(source, str) else source
+        return _compiled_system(system, False)
 
 
 @pytest.fixture(scope="session")
@@ -233,33 +236,33 @@ def modules() -> Modules:
 
 @pytest.fixture(scope="session")
 def cartpole(modules: Modules) -> ModuleType:
-    """No inputs, no time, no friction."""
+    """The cart-pole: no inputs, no time, no friction."""
     return modules("cartpole")
 
 
 @pytest.fixture(scope="session")
 def driven(modules: Modules) -> ModuleType:
-    """One input, with a signal that hangs on the time."""
+    """A cart-pole with one input, whose signal depends on time."""
     return modules("cartpole_driven")
 
 
 @pytest.fixture(scope="session")
 def everything(modules: Modules) -> ModuleType:
-    """All that a scene can say."""
+    """A scene with all features of the format."""
     return modules.of_text(EVERYTHING)
 
 
 @pytest.fixture
 def no_warnings() -> Iterator[None]:
-    """A warning is a failure."""
+    """Treat warnings as errors."""
     with warnings.catch_warnings(action="error"):
         yield
 
 
 def pytest_collection(session: pytest.Session) -> None:
-    """Of two workers that compile all tests to bytecode, the second begins at the end.
+    """Let the second of two workers that compile all tests to bytecode start at the end.
 
-    So each finds half of it done by the other, where none is kept from another run.
+    Then each worker finds half of it done by the other, if no bytecode exists.
     """
     whole = session.config.args == session.config.getini("testpaths")
     if os.environ.get("PYTEST_XDIST_WORKER") != "gw1" or not whole:
@@ -267,23 +270,22 @@ def pytest_collection(session: pytest.Session) -> None:
     files = sorted(Path(__file__).parent.rglob("test_*.py"))
     for file in reversed(files[len(files) // 2 :]):
         sys.path.insert(0, str(file.parent))  # as pytest does
-        with contextlib.suppress(Exception, pytest.skip.Exception):  # told when it is collected
+        with contextlib.suppress(Exception, pytest.skip.Exception):  # reported during collection
             importlib.import_module(file.stem)
 
 
 def pytest_collection_finish() -> None:
-    gc.freeze()  # what is imported and collected stays
+    gc.freeze()  # imported and collected objects stay alive
 
 
 def tiers(values: Iterable[Any], *quick: Any) -> list[Any]:
-    """Parameters: those whose first value is one of `quick`, and the others for the slow tier."""
+    """Return parameters, marking as slow those whose first value is not one of `quick`."""
     rows = [value if isinstance(value, tuple) else (value,) for value in values]
     return [pytest.param(*row, marks=() if row[0] in quick else pytest.mark.slow) for row in rows]
 
 
 def needs(compiler: str) -> str:
-    """The path of a compiler, or of what pip installed; where it isn't there, the test is skipped
-    and says so."""
+    """Return the path of a program, possibly installed by pip; skip the test if it is missing."""
     path = shutil.which(compiler) or shutil.which(compiler, path=str(Path(sys.executable).parent))
     if path is None:
         pytest.skip(f"{compiler} is not installed")

@@ -1,4 +1,4 @@
-"""The cases with constraints and trusted answers in data/constrained.json, as systems."""
+"""The cases with constraints and reference solutions in data/constrained.json, as systems."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from eomc.model.system import System
 from eomc.scene.read import parse
 
 DATA = Path(__file__).parent / "data" / "constrained.json"
-ROW = "row_"  # a constraint's name, before its number
+ROW = "row_"  # prefix of constraint names, before their number
 
 
 @cache
 def cases() -> dict[str, dict[str, Any]]:
-    """The cases by name; the file's own \"contract\" says what their keys mean."""
+    """Return the cases by name; "contract" in the file explains their keys."""
     return {case["name"]: case for case in json.loads(DATA.read_text())["cases"]}
 
 
 def quoted(pairs: dict[str, str]) -> list[str]:
-    """Lines of TOML."""
+    """Return lines of TOML."""
     return [f"{name} = {json.dumps(text)}" for name, text in pairs.items()]
 
 
 @cache
 def system(name: str, start: str = "assembled", redundant: bool = True) -> System:
-    """A case as a System, with the coarsest measured step size and t_end as its run.
+    """Return a case as a System, with the largest measured step size and t_end as its run.
 
-    start: "assembled", or the "guess" with what is held. redundant: whether the rows that
-    lambda_ref leaves out are marked.
+    start: "assembled", or "guess" with the fixed initial values. redundant: mark the constraints
+    that lambda_ref omits as redundant.
     """
     case = cases()[name]
     rows = [*case["constraints"], *case["velocity_constraints"]]
@@ -42,7 +42,7 @@ def system(name: str, start: str = "assembled", redundant: bool = True) -> Syste
     q, qd = (case["guess"]["q"], case["guess"]["qd"]) if from_guess else (case["q0"], case["qd0"])
     starts = zip(case["coordinates"], q, qd, strict=True)
     h = case["rk4_measured"][0]["h"] if case["rk4_measured"] else 0.01
-    made = from_scene(
+    system_of_case = from_scene(
         parse(
             "\n".join(
                 [
@@ -68,9 +68,10 @@ def system(name: str, start: str = "assembled", redundant: bool = True) -> Syste
             f"{name}.toml",
         )
     )
-    kept = (case["redundant"] or {}).get("lambda_rows", range(len(rows)))
+    independent = (case["redundant"] or {}).get("lambda_rows", range(len(rows)))
     constraints = tuple(
-        replace(c, redundant=redundant and k not in kept) for k, c in enumerate(made.constraints)
+        replace(c, redundant=redundant and k not in independent)
+        for k, c in enumerate(system_of_case.constraints)
     )
     coordinates = tuple(
         replace(
@@ -78,29 +79,29 @@ def system(name: str, start: str = "assembled", redundant: bool = True) -> Syste
             start_fixed=not from_guess or c.name in case["held"],
             rate_fixed=not from_guess or c.name in case["held_rates"],
         )
-        for c in made.coordinates
+        for c in system_of_case.coordinates
     )
     return replace(
-        made,
+        system_of_case,
         constraints=constraints,
         coordinates=coordinates,
     )
 
 
 def ends(name: str, *keys: str) -> tuple[np.ndarray, ...]:
-    """Vectors of a case: q_ref, qd_ref, qdd_ref, lambda_ref (0 of redundant rows), ..."""
-    case, found = cases()[name], []
+    """Return vectors of a case: q_ref, qd_ref, qdd_ref, lambda_ref (0 if redundant), ..."""
+    case, vectors = cases()[name], []
     for key in keys:
         x = np.array(case[key], float)
         if key.startswith("lambda") and case["redundant"]:
             whole = np.zeros(case["redundant"]["rows"])
             whole[case["redundant"]["lambda_rows"]] = x
             x = whole
-        found.append(x)
-    return tuple(found)
+        vectors.append(x)
+    return tuple(vectors)
 
 
 def error_of(name: str, q: Any) -> float:
-    """The error of q at t_end, relative to max(1, the largest entry)."""
+    """Return the error of q at t_end, relative to max(1, the largest entry)."""
     (reference,) = ends(name, "q_ref")
     return float(np.max(np.abs(np.asarray(q) - reference)) / max(1, np.max(np.abs(reference))))

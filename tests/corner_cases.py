@@ -1,8 +1,8 @@
-"""Scenes whose forces jump or bend, and where their motions end: in closed form, or piece by piece.
+"""Scenes with discontinuous or non-smooth forces, and the final values of their motions.
 
-The ends come from formulas of this file alone. Where there is no closed form, the motion between
-two corners, whose times are known, is extrapolated from midpoint steps (Hairer, Norsett & Wanner,
-Solving ODEs I, sec. II.9), right to some 1e-13.
+The final values come from formulas in this file. Without a closed form, the motion between two
+kinks, whose times are known, is extrapolated from midpoint steps (Hairer, Norsett & Wanner, Solving
+ODEs I, sec. II.9), accurate to about 1e-13.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ duration = 5
 
 
 def extrapolated(slope: Slope, y: State, t: float, span: float) -> State:
-    """The state after a short smooth span."""
+    """Return the state after a short smooth interval."""
     table: list[list[State]] = []
     for k in range(1, 9):
         h = span / (2 * k)
@@ -97,7 +97,7 @@ def extrapolated(slope: Slope, y: State, t: float, span: float) -> State:
 
 
 def through(slopes: Callable[[float], Slope], y: State, times: Sequence[float]) -> State:
-    """The state at the last time; slopes: what acts in the piece about a time."""
+    """Return the state at the last time; slopes(t) is the right-hand side of the piece around t."""
     for low, high in pairwise(times):
         parts = math.ceil((high - low) / 0.1)
         h = (high - low) / parts
@@ -107,17 +107,17 @@ def through(slopes: Callable[[float], Slope], y: State, times: Sequence[float]) 
 
 
 def pendulum(a: float) -> float:
-    """Corners where 20 |sin 3 t| = 1.5."""
+    """Return the final angle of a pendulum with kinks where 20 |sin 3 t| = 1.5."""
     width = math.asin(1.5 / 20) / 3
     corners = [k * math.pi / 3 + side * width for k in range(6) for side in (-1, 1)]
     times = [0.0, *(t for t in corners if 0 < t < 5), 5.0]
 
     def slopes(middle: float) -> Slope:
-        wanted = -20 * math.sin(3 * middle)
-        held = math.copysign(1.5, wanted) if abs(wanted) > 1.5 else None
+        command = -20 * math.sin(3 * middle)
+        saturated = math.copysign(1.5, command) if abs(command) > 1.5 else None
 
         def slope(y: State, t: float) -> State:
-            u = -20 * math.sin(3 * t) if held is None else held
+            u = -20 * math.sin(3 * t) if saturated is None else saturated
             return [y[1], u - G * math.sin(y[0])]
 
         return slope
@@ -126,7 +126,7 @@ def pendulum(a: float) -> float:
 
 
 def switched(a: float) -> float:
-    """Jumps at three times."""
+    """Return the final value with discontinuities at three times."""
 
     def slopes(middle: float) -> Slope:
         u = 2 * (middle > 0.731) - 3 * (middle > 1.377) + (middle > 2.6)
@@ -145,7 +145,7 @@ def switched(a: float) -> float:
 
 
 def rubbed(x: float, mu: float = 0.3) -> float:
-    """Half swings of pi/4 s, each about mu/16 on the side from which it comes."""
+    """Return the final value after half oscillations of pi/4 s about +-mu/16."""
     left, side = 3.0, 1.0
     while left > math.pi / 4:
         x, left, side = 2 * side * mu / 16 - x, left - math.pi / 4, -side
@@ -154,7 +154,7 @@ def rubbed(x: float, mu: float = 0.3) -> float:
 
 
 def bouncing(x: float) -> float:
-    """Parabolas, and between them arcs of the spring, x'' = -1000 x - g."""
+    """Return the final value of parabolas and arcs of the spring, x'' = -1000 x - g."""
     fall, w, sag = math.sqrt(2 * x / G), math.sqrt(1000), G / 1000
     fast = G * fall
     touch = (math.pi + 2 * math.atan(G / (fast * w))) / w
@@ -167,7 +167,9 @@ def bouncing(x: float) -> float:
 
 @dataclass(frozen=True)
 class Case:
-    """A scene, the least and largest start of its first coordinate, and where that ends."""
+    """A scene, the smallest and largest initial value of its first coordinate, and its final
+    value.
+    """
 
     text: str
     starts: tuple[float, float]

@@ -1,4 +1,4 @@
-"""Scenes with events that several files test."""
+"""Scenes with events that several test files use."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def event(name: str, when: str, *lines: str) -> str:
 
 
 def impacts(e: float, count: int) -> np.ndarray:
-    """The times of the first impacts, by the formula."""
+    """Return the times of the first impacts, by the formula."""
     times = [math.sqrt(2 / G)]
     for k in range(1, count):
         times.append(times[-1] + 2 * math.sqrt(2 * G) * e**k / G)

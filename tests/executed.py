@@ -1,6 +1,6 @@
-"""Which lines of the generator each scene's check and each quick test executes.
+"""Which lines of the generator the check of each scene and each quick test execute.
 
-They run in a copy of the tree, without optimisation, which is what `generator_mutants` changes.
+They run without optimisation in a copy of the tree, which `generator_mutants` changes.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ ROOT = Path(__file__).parents[1]
 PLACE = Path(os.environ.get("EOMC_MUTANTS", ROOT / "build" / "mutants"))
 TREE = PLACE / "tree"
 PACKAGE = TREE / "generator" / "eomc"
-WIDE = (3, 5, 8, 13, 21, 34)  # of random_scenes --wide, as well as those of scenes/
+WIDE = (3, 5, 8, 13, 21, 34)  # seeds of random_scenes --wide, in addition to scenes/
 STOPS = '[[event]]\nname = "low"\nwhen = "x"\naction = "stop"\n'
-NOTED = '[[event]]\nname = "low"\nwhen = "theta - 3"\n'
-RICH = {  # of scenes/, with more under [run] and at the end
+EVENT = '[[event]]\nname = "low"\nwhen = "theta - 3"\n'
+RICH = {  # of scenes/, with lines added under [run] and at the end
     "pendulum_xy": (
         'tolerance = 1e-9\nmethod = ["rk4", "gauss8", "dp8"]\n'
         "linearize = true\ndiscretize = true\n",
@@ -39,7 +39,7 @@ RICH = {  # of scenes/, with more under [run] and at the end
     "cartpole_driven": (
         'tolerance = 1e-8\nmethod = ["rk4", "dp8"]\nbatch = true\n'
         "linearize = true\ndiscretize = true\n",
-        NOTED,
+        EVENT,
     ),
     "double_pendulum": (
         'method = ["rk4", "gauss4", "gauss16", "euler"]\ntolerance = 1e-6\n',
@@ -56,8 +56,8 @@ PYTEST = ("-p", "no:cacheprovider", "-p", "no:xdist", "-q", "--tb=line", "-m", "
 
 
 @dataclass
-class Seen:
-    """Of a scene or a test: how long it took, the lines it executed, the files it read."""
+class Execution:
+    """Execution of a scene or a test: its duration, the executed lines, the files that it read."""
 
     seconds: float
     lines: dict[str, list[int]] = field(default_factory=dict)
@@ -67,19 +67,19 @@ class Seen:
 
 @dataclass
 class Executed:
-    """Scenes by name, quick tests that pass in the copy by pytest's name."""
+    """Scenes by name, and quick tests that pass in the copy by their pytest names."""
 
-    scenes: dict[str, Seen]
-    tests: dict[str, Seen]
+    scenes: dict[str, Execution]
+    tests: dict[str, Execution]
 
 
 def copied() -> str:
-    """The tree as it stands, copied; its digest."""
-    told = subprocess.run(
+    """Copy the tree in its current state; return its digest."""
+    listing = subprocess.run(
         ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
         cwd=ROOT, check=True, capture_output=True, text=True,
     ).stdout  # fmt: skip
-    files = sorted(file for file in told.split("\0") if file and (ROOT / file).is_file())
+    files = sorted(file for file in listing.split("\0") if file and (ROOT / file).is_file())
     total = hashlib.sha256()
     for file in files:
         total.update(file.encode() + (ROOT / file).read_bytes())
@@ -93,7 +93,7 @@ def copied() -> str:
     text = flags.read_text(encoding="utf-8")
     assert '("-O3", ' in text and '("-O2",)' in text
     flags.write_text(text.replace('("-O3", ', '("-O0", ').replace('("-O2",)', '("-O0",)'))
-    # a mutant may be as long as the original, and as old to a second
+    # A mutant may have the size and the modification time of the original.
     checked = py_compile.PycInvalidationMode.CHECKED_HASH
     for folder in (TREE / "generator", TREE / "tests"):
         compileall.compile_dir(folder, quiet=1, invalidation_mode=checked)
@@ -102,7 +102,7 @@ def copied() -> str:
 
 
 def enter() -> None:
-    """This process, a fork, works in the copy from now on."""
+    """Let this forked process use the copy from now on."""
     os.chdir(TREE)
     sys.dont_write_bytecode = True
     os.environ |= {
@@ -117,26 +117,26 @@ def enter() -> None:
 
 
 def executed(renew: bool = True) -> Executed:
-    """Of the tree as it stands, by running all of it unless that is kept.
+    """Return the executions in the current tree, by running everything unless it is stored.
 
-    renew: else of the copy as it stands, where there is one.
+    renew: if False, use the executions of an existing copy if there is one.
     """
-    found = [] if renew else [*PLACE.glob("executed_*.json")]
-    kept = found[0] if found else PLACE / f"executed_{copied()[:16]}.json"
-    if not kept.exists():
+    stored_files = [] if renew else [*PLACE.glob("executed_*.json")]
+    stored = stored_files[0] if stored_files else PLACE / f"executed_{copied()[:16]}.json"
+    if not stored.exists():
         scenes = dict(one for name in scene_names() for one in _watched(lambda n=name: _scene(n)))
         files = sorted(str(f.relative_to(TREE)) for f in (TREE / "tests").rglob("test_*.py"))
         tests = dict(one for file in files for one in _watched(lambda f=file: _file(f)))
-        made = Executed(scenes, tests)
+        result = Executed(scenes, tests)
         for old in PLACE.glob("executed_*.json"):
             old.unlink()
-        kept.write_text(json.dumps(asdict(made)))
-    read = json.loads(kept.read_text())
-    return Executed(*({k: Seen(**v) for k, v in read[x].items()} for x in ("scenes", "tests")))
+        stored.write_text(json.dumps(asdict(result)))
+    read = json.loads(stored.read_text())
+    return Executed(*({k: Execution(**v) for k, v in read[x].items()} for x in ("scenes", "tests")))
 
 
 def briefly() -> Executed:
-    """Of a few scenes, in nothing but their sources, and no tests."""
+    """Return digests of a few scenes' sources, without executed lines and tests."""
     copied()
 
     def digest(name: str) -> str:
@@ -145,29 +145,31 @@ def briefly() -> Executed:
 
         return Scene(name).digest
 
-    made = {name: in_a_fork(lambda n=name: digest(n), 120, group=True) for name in BRIEF}
-    assert all(how == "done" for how, _ in made.values()), made
-    return Executed({name: Seen(0, digest=str(told)) for name, (_, told) in made.items()}, {})
+    results = {name: in_a_fork(lambda n=name: digest(n), 120, group=True) for name in BRIEF}
+    assert all(how == "done" for how, _ in results.values()), results
+    return Executed(
+        {name: Execution(0, digest=str(value)) for name, (_, value) in results.items()}, {}
+    )
 
 
-def _watched(work: Callable[[], dict[str, Any]]) -> Iterable[tuple[str, Seen]]:
+def _watched(work: Callable[[], dict[str, Any]]) -> Iterable[tuple[str, Execution]]:
     how, value = in_a_fork(work, 900, group=True)
     if how != "done":
         print(f"not watched: {how} {value}", flush=True)
         return []
     assert isinstance(value, dict)
-    return [(name, Seen(**one)) for name, one in value.items()]
+    return [(name, Execution(**one)) for name, one in value.items()]
 
 
 def scene_names() -> list[str]:
-    """Those of scenes/, one with all that formulas can say, RICH ones, random ones."""
-    found = sorted(file.stem for file in (TREE / "scenes").glob("*.toml"))
+    """Return the names of scenes/, one scene with all features, RICH ones, random ones."""
+    names = sorted(file.stem for file in (TREE / "scenes").glob("*.toml"))
     rich = (f"rich {name}" for name in RICH)
-    return [*found, "EVERYTHING", *rich, *(f"wide {seed}" for seed in WIDE)]
+    return [*names, "EVERYTHING", *rich, *(f"wide {seed}" for seed in WIDE)]
 
 
 def scene_text(name: str) -> str:
-    """The text of one of them."""
+    """Return the text of one of these scenes."""
     if name.startswith("wide"):
         from scene_author_wide import wide_text
 
@@ -185,7 +187,7 @@ def scene_text(name: str) -> str:
 
 
 class Watch:
-    """Coverage by context, and each file of the copy that is read."""
+    """Coverage by context, and the files of the copy that are read."""
 
     def __init__(self) -> None:
         import coverage
@@ -196,15 +198,19 @@ class Watch:
         self.read: set[str] = set()
         sys.addaudithook(self._opened)
 
-    def _opened(self, event: str, given: tuple[Any, ...]) -> None:
-        if event == "open" and isinstance(given[0], str) and given[0].startswith(f"{TREE}/"):
-            self.read.add(given[0].removeprefix(f"{TREE}/"))
+    def _opened(self, event: str, arguments: tuple[Any, ...]) -> None:
+        if (
+            event == "open"
+            and isinstance(arguments[0], str)
+            and arguments[0].startswith(f"{TREE}/")
+        ):
+            self.read.add(arguments[0].removeprefix(f"{TREE}/"))
 
     def lines(self) -> dict[str, dict[str, list[int]]]:
-        """Lines by file, by context; a copy of a file of runtime/ counts as that file."""
+        """Return lines by file, by context; a copy of a file of runtime/ counts as that file."""
         self.coverage.stop()
         data = self.coverage.get_data()
-        found: dict[str, dict[str, list[int]]] = defaultdict(dict)
+        result: dict[str, dict[str, list[int]]] = defaultdict(dict)
         for file in data.measured_files():
             own = Path(file)
             if not own.is_relative_to(PACKAGE):
@@ -214,12 +220,12 @@ class Watch:
             name = str(own.relative_to(TREE))
             for line, contexts in data.contexts_by_lineno(file).items():
                 for context in contexts:
-                    found[context].setdefault(name, []).append(line)
-        return found
+                    result[context].setdefault(name, []).append(line)
+        return result
 
 
 def _scene(name: str) -> dict[str, Any]:
-    """Derived, built, checked."""
+    """Derive, build and check a scene."""
     import time
 
     enter()
@@ -233,11 +239,13 @@ def _scene(name: str) -> dict[str, Any]:
     assert not faults, faults
     seconds = time.perf_counter() - began
     watch.coverage.switch_context("")
-    return {name: asdict(Seen(seconds, watch.lines()["scene"], sorted(watch.read), scene.digest))}
+    return {
+        name: asdict(Execution(seconds, watch.lines()["scene"], sorted(watch.read), scene.digest))
+    }
 
 
 def _file(file: str) -> dict[str, Any]:
-    """The quick tests of a file."""
+    """Run the quick tests of a file."""
     import pytest
 
     enter()
@@ -257,34 +265,38 @@ def _file(file: str) -> dict[str, Any]:
     pytest.main([*PYTEST, file], plugins=[Contexts()])
     lines, read = watch.lines(), sorted(watch.read)
     return {
-        test: asdict(Seen(took, lines.get(test, {}), read))
+        test: asdict(Execution(took, lines.get(test, {}), read))
         for test, took in seconds.items()
         if test not in bad
     }
 
 
 OF_TEXTS = ("tests/c/", "tests/emit/", "tests/physics/", "tests/runtime/", "tests/toolchain/")
-A_FILE = 2  # tests of each file that are asked of a template
+A_FILE = 2  # tests of each file that run for a template
 
 
-def tests_of(seen: Executed, file: str, lines: set[int]) -> Sequence[str]:
-    """Tests for lines of Python: those that execute them, then those that execute their file.
+def tests_of(executions: Executed, file: str, lines: set[int]) -> Sequence[str]:
+    """Return tests for lines of Python: those that execute them, then those of their file.
 
-    For a template or C: some of each file of tests of what is generated. The quickest first, but
-    golden files last: they notice what changes nothing, too.
+    For a template or C, return some of each test file of generated code. The fastest come first,
+    but golden tests last, because they also detect changes without effect.
     """
 
     def rank(test: str) -> tuple[bool, bool, float]:
-        one = seen.tests[test]
+        one = executions.tests[test]
         return lines.isdisjoint(one.lines.get(file, ())), "golden" in test, one.seconds
 
     if lines:
-        return sorted((t for t, one in seen.tests.items() if file in one.lines), key=rank)
+        return sorted((t for t, one in executions.tests.items() if file in one.lines), key=rank)
     chosen: list[str] = []
     counts: Counter[str] = Counter()
-    for test in sorted(seen.tests, key=rank):
+    for test in sorted(executions.tests, key=rank):
         own = test.split("::")[0]
-        if own.startswith(OF_TEXTS) and file in seen.tests[test].read and counts[own] < A_FILE:
+        if (
+            own.startswith(OF_TEXTS)
+            and file in executions.tests[test].read
+            and counts[own] < A_FILE
+        ):
             counts[own] += 1
             chosen.append(test)
     return chosen

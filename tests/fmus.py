@@ -1,4 +1,4 @@
-"""Units of FMI for tests: scenes exported once, an importer over FMPy, alike for both versions."""
+"""FMUs for tests: scenes exported once, and one interface to FMPy for both versions of FMI."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ VERSIONS = (2, 3)
 BUILT = ROOT / "build" / "tests" / "fmu"
 FOLDER = Path(tempfile.mkdtemp(prefix="eomc-fmus-"))  # of this process
 
-# a ball that is thrown against a wall: jumps, a stop, an input with limits and a signal, an output
+# A ball thrown against a wall: jumps, a stop, an input with limits and a signal, an output.
 BALL = """
 eomc = 1
 name = "ball"
@@ -70,7 +70,7 @@ duration = 3
 linearize = true
 """
 
-# limits, starts that are formulas of parameters, derivatives with respect to parameters
+# Limits, initial values that are formulas of parameters, derivatives by parameters.
 RIG = """
 eomc = 1
 name = "rig"
@@ -100,7 +100,7 @@ h = 0.01
 linearize = "parameters"
 """
 
-# in single precision, with the method that is implicit, and an input that answers the state
+# Single precision, the implicit method, and an input that depends on the state.
 FLOAT = """
 eomc = 1
 name = "soft"
@@ -122,21 +122,21 @@ real = "float"
 
 
 def _unoptimised(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compiled in a third of the time: strict C99 has the same bits at every level."""
+    """Compile without optimisation, in a third of the time: strict C99 gives equal bits."""
 
     @cache
     @wraps(function)
-    def called(*given: Any) -> Any:
+    def called(*arguments: Any) -> Any:
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv("EOMC_CFLAGS", "-O0")
-            return function(*given)
+            return function(*arguments)
 
     return called
 
 
 @cache
 def derived_of(scene: str) -> Program:
-    """Of a scene in scenes/ by its name, or of a scene as text."""
+    """Return the program of a scene in scenes/ by its name, or of a scene as text."""
     if "\n" not in scene:
         system = pipeline.read(SCENES / f"{scene}.toml")
     else:
@@ -146,7 +146,7 @@ def derived_of(scene: str) -> Program:
 
 @_unoptimised
 def plain(scene: str) -> ModuleType:
-    """The module of the plain form, of a scene in scenes/ or of a text."""
+    """Return the module of portable C, of a scene in scenes/ or of a text."""
     if "\n" not in scene:
         return eomc.load(SCENES / f"{scene}.toml", BUILT, form="plain")
     system = from_scene(parse(scene, "test.toml"))
@@ -155,22 +155,24 @@ def plain(scene: str) -> ModuleType:
 
 @_unoptimised
 def exported(scene: str, version: int) -> Path:
-    """The file of a unit: of a scene in scenes/ by its name, or of a scene as text."""
-    made = derived_of(scene)
-    file = FOLDER / f"{made.system.digest[:12]}-{version}.fmu"
-    return fmu.export(render.unit(made, version), file).file
+    """Return the file of an exported FMU, of a scene in scenes/ by its name or of a scene as
+    text.
+    """
+    program = derived_of(scene)
+    file = FOLDER / f"{program.system.digest[:12]}-{version}.fmu"
+    return fmu.export(render.unit(program, version), file).file
 
 
 @cache
 def extracted(file: Path) -> str:
-    """The folder of what is inside."""
+    """Return the folder of the extracted files."""
     from fmpy import extract
 
     return str(extract(str(file), str(FOLDER / f"{file.stem}-inside")))
 
 
 class Host:
-    """An instance. kind: "CoSimulation" or "ModelExchange"; said: what it has logged."""
+    """An instance. kind: "CoSimulation" or "ModelExchange"; said: its log messages."""
 
     def __init__(
         self, file: Path, kind: str = "CoSimulation", logging: bool = False, folder: str = ""
@@ -188,7 +190,7 @@ class Host:
         )
         self.of = {v.name: v.valueReference for v in described.modelVariables}
         self.t = 0.0
-        self.returned_early = False  # what FMI 3.0 says of the last step
+        self.returned_early = False  # early return of the last step in FMI 3.0
 
     def _logged2(self, _: Any, name: bytes, status: int, category: bytes, message: bytes) -> None:
         self.said.append((category.decode(), message.decode()))
@@ -223,10 +225,10 @@ class Host:
         self.unit.exitInitializationMode()
 
     def step(self, size: float) -> bool:
-        """A communication step; whether the unit wants to end."""
-        told = None
+        """Do a communication step; return True if the FMU requests termination."""
+        result = None
         if self.three:
-            told = self.unit.doStep(self.t, size)
+            result = self.unit.doStep(self.t, size)
         else:
             from fmpy.fmi1 import FMICallException
 
@@ -237,11 +239,11 @@ class Host:
                     raise
                 self.t = self.unit.getRealStatus(2)  # fmi2LastSuccessfulTime
                 return True
-        self.returned_early = bool(told and told[2])
-        self.t = told[3] if told else self.t + size
-        return bool(told and told[1])
+        self.returned_early = bool(result and result[2])
+        self.t = result[3] if result else self.t + size
+        return bool(result and result[1])
 
-    def kept(self) -> Any:
+    def saved_state(self) -> Any:
         return self.unit.getFMUState()
 
     def restore(self, state: Any) -> None:
@@ -262,14 +264,14 @@ class Host:
 
 
 def needs_fmpy() -> None:
-    """Skip where FMPy is not installed, by name."""
+    """Skip the test, with the reason, if FMPy is not installed."""
     pytest.importorskip("fmpy", reason="FMPy is not installed: pip install '.[fmu]'")
 
 
 def rows(host: Host, names: Sequence[str], size: float, count: int) -> np.ndarray:
-    """The values at the start and after each of so many steps."""
-    found = [host.get(*names)]
+    """Return the initial values and those after each of `count` steps."""
+    values = [host.get(*names)]
     for _ in range(count):
         host.step(size)
-        found.append(host.get(*names))
-    return np.array(found)
+        values.append(host.get(*names))
+    return np.array(values)

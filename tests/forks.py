@@ -1,4 +1,4 @@
-"""Work in a process of its own, which nothing of it outlives."""
+"""Run work in a forked process, which leaves no processes behind."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from contextlib import suppress
 def in_a_fork(
     work: Callable[[], object], seconds: float, group: bool = False
 ) -> tuple[str, object]:
-    """What `work` returns, as JSON tells it, from a process of its own.
+    """Return the result of `work`, passed as JSON from a process of its own.
 
-    ("done", value), ("raised", its words), ("killed", the signal) or ("late", None).
-    group: also end what it has started and left.
+    It is ("done", value), ("raised", message), ("killed", signal) or ("late", None). group: also
+    end processes that it has started and left.
     """
     reading, writing = os.pipe()
     child = os.fork()
@@ -27,15 +27,15 @@ def in_a_fork(
         if group:
             os.setpgid(0, 0)
         try:
-            told: tuple[str, object] = ("done", work())
+            result: tuple[str, object] = ("done", work())
         except BaseException as fault:
-            told = ("raised", f"{type(fault).__name__}: {fault}")
+            result = ("raised", f"{type(fault).__name__}: {fault}")
         with os.fdopen(writing, "w") as pipe:
-            json.dump(told, pipe)
+            json.dump(result, pipe)
         _flush_and_leave()
     os.close(writing)
     try:
-        return _told(child, reading, seconds)
+        return _receive(child, reading, seconds)
     finally:
         if group:
             with suppress(ProcessLookupError):
@@ -47,7 +47,7 @@ def _flush_and_leave() -> None:
     os._exit(0)
 
 
-def _told(child: int, reading: int, seconds: float) -> tuple[str, object]:
+def _receive(child: int, reading: int, seconds: float) -> tuple[str, object]:
     end, text = time.monotonic() + seconds, b""
     with os.fdopen(reading, "rb", buffering=0) as pipe:
         while select.select([pipe], [], [], max(0.0, end - time.monotonic()))[0]:

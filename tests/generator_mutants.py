@@ -1,13 +1,14 @@
-"""Mutants of the generator: its Python, its templates and its C by hand, changed in one place each.
+"""Mutants of the generator: its Python, its templates and its handwritten C, with one change each.
 
     python tests/generator_mutants.py --count 300 --seed 1
     python tests/generator_mutants.py --only derive/tape --count 50
     python tests/generator_mutants.py --only derive/tape.py:120      all of a line
 
-Modules take turns, a random mutant each. One is caught where scenes are refused, don't compile or
-fail `eomc check`, or where a quick test fails: first those that execute the line. What does not
-even import, parse or compile counts as none. Of survivors it says whether any scene's files change.
-The first run executes all tests under coverage, which takes some minutes. Needs coverage.
+Modules take turns, with a random mutant each. A mutant is caught if scenes are refused, do not
+compile or fail `eomc check`, or if a quick test fails: first those that execute the line. A mutant
+that cannot be imported, parsed or compiled does not count. For survivors the output states whether
+the files of any scene change. The first run executes all tests under coverage, which takes some
+minutes. Needs coverage.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from executed import (
     PLACE,
     TREE,
     Executed,
-    Seen,
+    Execution,
     briefly,
     enter,
     executed,
@@ -52,14 +53,15 @@ TEMPLATES = (
 )  # their C
 HEAVY = ("numpy", "sympy", "cffi", "pydantic", "jinja2", "pytest", "hypothesis", "coverage",
          "click", "rich", "defusedxml.ElementTree", "scipy.linalg")  # fmt: skip
-FEW, MORE, MOST = 12, 15.0, 40  # tests at once, seconds of others and their number
-UNPRINTED = ("generator/eomc/verify/",)  # no word of which is in the C
+# number of tests run first, seconds of further ones and their number
+FEW, MORE, MOST = 12, 15.0, 40
+UNPRINTED = ("generator/eomc/verify/",)  # modules without influence on the C
 CHECKED_FIRST = tuple(f"generator/eomc/{room}/" for room in ("derive", "program", "emit", "model"))
 
 
 @dataclass(frozen=True)
 class Place:
-    """A mutant in its file, whose name begins at the root of the tree."""
+    """A mutant in its file, whose name is relative to the root of the tree."""
 
     file: str
     source: str
@@ -67,22 +69,24 @@ class Place:
 
     @property
     def line(self) -> int:
-        """Counted from one."""
+        """Return the line number, counted from one."""
         return self.source.count("\n", 0, self.mutant.at) + 1
 
     @property
     def lines(self) -> set[int]:
-        """Those of its statement, one of which coverage counts; none in texts."""
+        """Return the lines of its statement, one of which coverage counts; none in templates and
+        C.
+        """
         if not self.file.endswith(".py"):
             return set()
-        found = {self.line}
+        numbers = {self.line}
         for node in ast.walk(ast.parse(self.source)):
             if isinstance(node, ast.stmt):
                 inside = getattr(node, "body", None)
                 end = inside[0].lineno - 1 if inside else node.end_lineno
                 if node.lineno <= self.line <= (end or 0):
-                    found = set(range(node.lineno, (end or 0) + 1))
-        return found
+                    numbers = set(range(node.lineno, (end or 0) + 1))
+        return numbers
 
     def __str__(self) -> str:
         old = self.source[self.mutant.at : self.mutant.end]
@@ -93,20 +97,20 @@ class Place:
 
 
 def files() -> dict[str, list[Mutant]]:
-    """The mutants of each file."""
-    found = {}
+    """Return the mutants of each file."""
+    by_file = {}
     for file in sorted(PACKAGE.rglob("*.py")):
         name = str(file.relative_to(PACKAGE))
         if name.split("/")[0].removesuffix(".py") in MODULES:
-            found[str(file.relative_to(TREE))] = of_python(file.read_text(encoding="utf-8"))
+            by_file[str(file.relative_to(TREE))] = of_python(file.read_text(encoding="utf-8"))
     for folder in TEMPLATES:
         for file in sorted((TREE / folder).rglob("*.[ch]*")):
-            found[str(file.relative_to(TREE))] = of_template(file.read_text(encoding="utf-8"))
-    return {name: mutants for name, mutants in found.items() if mutants}
+            by_file[str(file.relative_to(TREE))] = of_template(file.read_text(encoding="utf-8"))
+    return {name: mutants for name, mutants in by_file.items() if mutants}
 
 
 def sample(only: Sequence[str], count: int, seed: int) -> Iterator[Place]:
-    """Each file's in turn, in a random order that is the same for the same seed."""
+    """Yield a mutant of each file in turn, in an order that the seed determines."""
     draw = random.Random(seed)
     places: dict[str, list[Place]] = {}
     for name, mutants in files().items():
@@ -125,32 +129,32 @@ def sample(only: Sequence[str], count: int, seed: int) -> Iterator[Place]:
                 return
 
 
-def judge(place: Place, seen: Executed) -> tuple[str, str]:
-    """ "no mutant", "check", "tests", "other bytes" or "same bytes", and by what.
+def judge(place: Place, executions: Executed) -> tuple[str, str]:
+    """Return "no mutant", "check", "tests", "other bytes" or "same bytes", and the cause.
 
-    A test that fails without the mutant too, in the copy or on a busy machine, is not asked again.
+    A test that also fails without the mutant, in the copy or on a busy machine, is not used again.
     """
     while True:
         file, before = TREE / place.file, PLACE / "before.json"
         before.write_text(json.dumps({place.file: place.source}), encoding="utf-8")
-        file.write_text(place.mutant.of(place.source), encoding="utf-8")
+        file.write_text(place.mutant.apply(place.source), encoding="utf-8")
         try:
-            verdict, words = _judged(place, seen)
+            verdict, words = _judge(place, executions)
         finally:
-            undone()
-        if words not in seen.tests:
+            restore_file()
+        if words not in executions.tests:
             return verdict, words
         alone = [words]
         right = in_a_fork(
-            lambda alone=alone: _asked("by_tests", alone), _limit(alone, seen), group=True
+            lambda alone=alone: _run_judge("by_tests", alone), _limit(alone, executions), group=True
         )
         if right == ("done", ["passed", ""]):
             return verdict, words
-        del seen.tests[words]
+        del executions.tests[words]
 
 
-def undone() -> None:
-    """The file of the last mutant as it was, also where a run was killed."""
+def restore_file() -> None:
+    """Restore the file of the last mutant, also after a killed run."""
     before = PLACE / "before.json"
     if before.exists():
         for name, source in json.loads(before.read_text(encoding="utf-8")).items():
@@ -158,7 +162,7 @@ def undone() -> None:
         before.unlink()
 
 
-def _judged(place: Place, seen: Executed) -> tuple[str, str]:
+def _judge(place: Place, executions: Executed) -> tuple[str, str]:
     python = place.file.endswith(".py")
     if python:
         module = place.file.removeprefix("generator/").removesuffix(".py").replace("/", ".")
@@ -171,70 +175,70 @@ def _judged(place: Place, seen: Executed) -> tuple[str, str]:
             return "no mutant", ""
     lines = place.lines
     scenes = sorted(
-        (name for name, one in seen.scenes.items() if runs(one, place.file, lines)),
-        key=lambda name: seen.scenes[name].seconds,
+        (name for name, one in executions.scenes.items() if runs(one, place.file, lines)),
+        key=lambda name: executions.scenes[name].seconds,
     )
-    right = {name: one.digest for name, one in seen.scenes.items()}
+    right = {name: one.digest for name, one in executions.scenes.items()}
     same = place.file.startswith(UNPRINTED)
-    tests = list(tests_of(seen, place.file, lines))
-    few, more = tests[:FEW], _until(MORE, tests[FEW : FEW + MOST], seen)
-    ways: list[tuple[str, float, Callable[[], tuple[str, str]]]] = [
-        ("check", 90, lambda: _asked("by_check", scenes, right, 4, 15.0, same)),
-        ("tests", _limit(few, seen), lambda: _asked("by_tests", few)),
-        ("tests", _limit(more, seen), lambda: _asked("by_tests", more)),
-        # what passes all that is asked about at length
-        ("check", 400, lambda: _asked("by_check", scenes, right, 40, 200.0, same)),
-        ("tests", 900, lambda: _asked("by_tests", _own(place.file, seen))),
+    tests = list(tests_of(executions, place.file, lines))
+    few, more = tests[:FEW], _tests_within(MORE, tests[FEW : FEW + MOST], executions)
+    judges: list[tuple[str, float, Callable[[], tuple[str, str]]]] = [
+        ("check", 90, lambda: _run_judge("by_check", scenes, right, 4, 15.0, same)),
+        ("tests", _limit(few, executions), lambda: _run_judge("by_tests", few)),
+        ("tests", _limit(more, executions), lambda: _run_judge("by_tests", more)),
+        # survivors are checked at length
+        ("check", 400, lambda: _run_judge("by_check", scenes, right, 40, 200.0, same)),
+        ("tests", 900, lambda: _run_judge("by_tests", _tests_of_folder(place.file, executions))),
     ]
-    if not seen.tests:
-        ways = ways[:1]
+    if not executions.tests:
+        judges = judges[:1]
     elif python and not place.file.startswith(CHECKED_FIRST):
-        ways[:2] = reversed(ways[:2])
+        judges[:2] = reversed(judges[:2])
     left = ("", "")
-    for way, limit, ask in ways:
-        how, told = in_a_fork(ask, limit, group=True)
+    for kind, limit, ask in judges:
+        how, result = in_a_fork(ask, limit, group=True)
         if how != "done":
-            return way, f"{how} {told}"
-        assert isinstance(told, list)
-        by, words = told
+            return kind, f"{how} {result}"
+        assert isinstance(result, list)
+        by, words = result
         if by == "caught":
             broken = ("Template", "compiler failed", "error: ")
-            known = python or way == "tests" or not any(b in words for b in broken)
-            return (way if known else "no mutant"), words
-        if way == "check":
+            known = python or kind == "tests" or not any(b in words for b in broken)
+            return (kind if known else "no mutant"), words
+        if kind == "check":
             left = by, words
     return left
 
 
-def _limit(tests: Sequence[str], seen: Executed) -> float:
-    return 45 + 5 * sum(seen.tests[test].seconds for test in tests)
+def _limit(tests: Sequence[str], executions: Executed) -> float:
+    return 45 + 5 * sum(executions.tests[test].seconds for test in tests)
 
 
-def _own(file: str, seen: Executed) -> list[str]:
-    """The quick tests of the folder that a file belongs to, or of what is generated."""
+def _tests_of_folder(file: str, executions: Executed) -> list[str]:
+    """Return the quick tests of the folder that a file belongs to, or of generated code."""
     room = Path(file).parts[2] if file.startswith("generator/") else ""
     folders = (f"tests/{room}/",) if room else OF_TEXTS
-    return [test for test in seen.tests if test.startswith(folders)]
+    return [test for test in executions.tests if test.startswith(folders)]
 
 
-def _asked(what: str, *given: object) -> tuple[str, str]:
+def _run_judge(what: str, *arguments: object) -> tuple[str, str]:
     enter()
     import judged
 
-    told: tuple[str, str] = getattr(judged, what)(*given)
-    return told
+    result: tuple[str, str] = getattr(judged, what)(*arguments)
+    return result
 
 
-def runs(one: Seen, file: str, lines: set[int]) -> bool:
-    """Whether a scene's check executes lines; of texts, and of what was not watched, perhaps."""
+def runs(one: Execution, file: str, lines: set[int]) -> bool:
+    """Return whether a scene's check executes lines; True for templates and unrecorded scenes."""
     return not lines or not one.lines or not lines.isdisjoint(one.lines.get(file, ()))
 
 
-def _until(seconds: float, tests: Sequence[str], seen: Executed) -> list[str]:
-    """As many as take so long."""
+def _tests_within(seconds: float, tests: Sequence[str], executions: Executed) -> list[str]:
+    """Return the first tests that take at most the given time."""
     chosen, left = [], seconds
     for test in tests:
-        left -= seen.tests[test].seconds + 0.01
+        left -= executions.tests[test].seconds + 0.01
         if left < 0:
             break
         chosen.append(test)
@@ -242,7 +246,7 @@ def _until(seconds: float, tests: Sequence[str], seen: Executed) -> list[str]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """The command."""
+    """Run the command."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
@@ -251,26 +255,26 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--minutes", type=float, default=1e9)
     parser.add_argument("--kept", action="store_true", help="the copy of the last run")
     parser.add_argument("--brief", action="store_true", help="three scenes alone, and no tests")
-    given = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     (PLACE / "tmp").mkdir(parents=True, exist_ok=True)
-    undone()
+    restore_file()
     for name in HEAVY:
         importlib.import_module(name)
-    seen = briefly() if given.brief else executed(not given.kept)
+    executions = briefly() if options.brief else executed(not options.kept)
     counts: Counter[str] = Counter()
     rooms: dict[str, Counter[str]] = defaultdict(Counter)
-    end = time.monotonic() + 60 * given.minutes
-    for place in sample(given.only, given.count, given.seed):
+    end = time.monotonic() + 60 * options.minutes
+    for place in sample(options.only, options.count, options.seed):
         if time.monotonic() > end:
             break
         began = time.monotonic()
-        verdict, words = judge(place, seen)
+        verdict, words = judge(place, executions)
         counts[verdict] += 1
         rooms["/".join(Path(place.file).parts[:3])][verdict] += 1
-        if given.log:
+        if options.log:
             row = {"verdict": verdict, "place": str(place), "by": words,
                    "seconds": round(time.monotonic() - began, 1)}  # fmt: skip
-            with given.log.open("a") as log:
+            with options.log.open("a") as log:
                 print(json.dumps(row), file=log)
         if verdict.endswith("bytes"):
             print(f"{verdict}: {place}   {words}", flush=True)

@@ -1,4 +1,4 @@
-"""A scene's C compiled with other flags, or changed, and its check in a process of its own."""
+"""Compile a scene's C with other flags or changes, and check it in a process of its own."""
 
 from __future__ import annotations
 
@@ -25,27 +25,29 @@ COVERAGE = ("-O0", "--coverage", "-march=native", "-fno-math-errno", "-fno-trapp
 
 
 class Shipped:
-    """The files of a scene in a folder, to be compiled as often as one likes."""
+    """The files of a scene in a folder, to be compiled any number of times."""
 
     def __init__(self, system: System, folder: Path) -> None:
         self.name, self.folder = system.name, folder
         self.extension = f"_{self.name}_tried"
         self.compiler = compiling.find_compiler().command
-        made = eomc.sources(system, self.extension)
+        sources = eomc.sources(system, self.extension)
         folder.mkdir(parents=True, exist_ok=True)
-        runtime = {f: text for f, text in made.files.items() if f.startswith("_runtime/")}
-        files = fast_kit(made) | runtime
+        runtime = {f: text for f, text in sources.files.items() if f.startswith("_runtime/")}
+        files = fast_kit(sources) | runtime
         write_files(files, folder)
         self.source = files[f"{self.name}.c"]
         ffi = cffi.FFI()
-        ffi.cdef(made.cdef)
-        ffi.set_source(self.extension, made.binding)
+        ffi.cdef(sources.cdef)
+        ffi.set_source(self.extension, sources.binding)
         ffi.emit_c_code(str(folder / "binding.c"))
         include = {sysconfig.get_path("include"), sysconfig.get_path("platinclude")}
         self._run("-fPIC", "-O0", *(f"-I{p}" for p in include), "-c", "binding.c")
 
     def compile(self, flags: Sequence[str], source: str | None = None) -> str | None:
-        """Compile and link, `source` in place of the shipped text; the compiler's words if not."""
+        """Compile and link, with `source` in place of the shipped text; return the errors, if
+        any.
+        """
         text = self.source if source is None else source
         (self.folder / f"{self.name}.c").write_text(text, encoding="utf-8")
         library = self.extension + str(sysconfig.get_config_var("EXT_SUFFIX"))
@@ -59,7 +61,7 @@ class Shipped:
         return None
 
     def load(self) -> ModuleType:
-        """Import what was compiled; once in a process."""
+        """Import the compiled module; only once in a process."""
         spec = spec_from_file_location(
             f"tried_{self.folder.name}",
             self.folder / "__init__.py",
@@ -96,8 +98,8 @@ sys.exit(0 if report.passed else 1)
 """
 
 
-def missed(scene_text: str, folder: Path) -> tuple[str, list[tuple[int, str]]]:
-    """The table of a scene's check, and the lines of its NAME.c that were not executed."""
+def check_coverage(scene_text: str, folder: Path) -> tuple[str, list[tuple[int, str]]]:
+    """Return the table of a scene's check, and the lines of its NAME.c that were not executed."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "scene.toml").write_text(scene_text, encoding="utf-8")
     here = str(Path(__file__).parent)
@@ -113,15 +115,15 @@ def missed(scene_text: str, folder: Path) -> tuple[str, list[tuple[int, str]]]:
 
 
 def unexecuted(folder: Path) -> Iterator[tuple[int, str]]:
-    """The lines that gcov counts as not executed, from scene.gcda: their numbers and texts."""
-    told = subprocess.run(
+    """Yield the lines that gcov counts as not executed, from scene.gcda: numbers and texts."""
+    output = subprocess.run(
         ["gcov", "--json-format", "--stdout", "scene.gcda"],
         cwd=folder, check=True, capture_output=True,
     ).stdout  # fmt: skip
-    if told[:2] == b"\x1f\x8b":
-        told = gzip.decompress(told)
+    if output[:2] == b"\x1f\x8b":
+        output = gzip.decompress(output)
     counts: dict[int, int] = {}
-    for line in told.splitlines():
+    for line in output.splitlines():
         for file in json.loads(line)["files"]:
             if not file["file"].endswith(".c"):
                 continue

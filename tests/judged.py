@@ -1,4 +1,6 @@
-"""What `generator_mutants` asks of a mutant, in a process of its own, in its copy of the tree."""
+"""Checks and tests of one mutant of `generator_mutants`, in a forked process, in the copied
+tree.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,7 @@ from eomc.verify.check import check
 
 
 class Scene:
-    """A scene derived and printed."""
+    """A scene, derived and rendered."""
 
     def __init__(self, name: str) -> None:
         os.environ["EOMC_CFLAGS"] = "-O0"
@@ -37,11 +39,11 @@ class Scene:
         self.digest = hashlib.sha256(repr(texts).encode()).hexdigest()
 
     def faults(self) -> list[str]:
-        """The rows of the check that fail."""
+        """Return the failed checks."""
         with tempfile.TemporaryDirectory(dir=PLACE / "tmp") as folder:
-            kept = PLACE / "compiled"
-            fast = built(self.sources, Path(folder) / "fast", "fast", kept)
-            plain = built(self.sources, Path(folder) / "plain", "plain", kept)
+            compiled = PLACE / "compiled"
+            fast = built(self.sources, Path(folder) / "fast", "fast", compiled)
+            plain = built(self.sources, Path(folder) / "plain", "plain", compiled)
             report = check(self.made, fast, plain=plain)
         return [row.name for row in report.results if not row.passed]
 
@@ -53,10 +55,11 @@ def by_check(
     seconds: float,
     same: bool = False,
 ) -> tuple[str, str]:
-    """What `eomc check` says: ("caught", by what), ("other bytes", scenes) or ("same bytes", "").
+    """Run `eomc check`: return ("caught", cause), ("other bytes", scenes) or ("same bytes", "").
 
-    right: the digest of each scene's sources as they are without the mutant. most: how many scenes
-    are checked. seconds: after which no other is begun. same: those of the same sources too.
+    right: digests of the scenes' sources without the mutant. most: number of scenes to check.
+    seconds: no further check starts after this time. same: also check scenes with unchanged
+    sources.
     """
     others, count, began = [], 0, time.monotonic()
     for name in scenes:
@@ -78,10 +81,10 @@ def by_check(
 
 
 def by_tests(tests: Sequence[str]) -> tuple[str, str]:
-    """("caught", the first that fails), or ("passed", "")."""
+    """Return ("caught", first failed test), or ("passed", "")."""
     if not tests:
         return "passed", ""
-    # each mutant builds anew, but what is compiled from the same C is remembered
+    # Each mutant is built from scratch, but compilations of the same C are reused.
     shutil.rmtree(TREE / "build", ignore_errors=True)
     (TREE / "build").mkdir()
     cache.generator_digest = lambda: "a mutant's"

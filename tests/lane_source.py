@@ -1,4 +1,4 @@
-"""The C of csrc/lanes over lanes of every width, and functions that call it for arrays."""
+"""The C of csrc/lanes for vectors of every width, and functions that call it for arrays."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from conftest import ROOT
 from sincos_bench import bench
 
-VECTORS = {"_16": 16, "_32": 32, "_64": 64}  # bytes by what names end in
+VECTORS = {"_16": 16, "_32": 32, "_64": 64}  # bytes, by the suffix of names
 LANES = ("", *VECTORS)
 BUILDS = {
     "native": bench.SPEED,
@@ -21,7 +21,7 @@ BUILDS = {
     "narrow registers": ("-O1",),
 }
 EXPONENTIALS = ("exp", "tanh")
-MOST = 16  # numbers in the widest of them
+MOST = 16  # numbers in the widest vector
 
 ONE = """
 typedef EOMC_REAL eomc_LANE_unaligned;
@@ -166,16 +166,16 @@ void interleave(const EOMC_REAL *x, const EOMC_REAL *y, EOMC_REAL *to)
 """
 
 
-def over(of: Any, text: str, name: str = "", width: int = 0) -> str:
-    """A text of csrc/lanes over a lane of so many bytes, or over one number."""
-    real, double = ("float", False) if of.suffix else ("double", True)
+def over(precision: Any, text: str, name: str = "", width: int = 0) -> str:
+    """Return a text of csrc/lanes for vectors of `width` bytes, or for scalars."""
+    real, double = ("float", False) if precision.suffix else ("double", True)
     for old, new in (
         ("EOMC_BITS_OF_SIZE", "0x7fffffffffffffff" if double else "0x7fffffff"),
         ("EOMC_INTEGER", "long long" if double else "int"),
         ("EOMC_LANE_ALIGNED", str(min(width, 16))),
         ("EOMC_LANE_BYTES", str(width)),
         ("EOMC_LANE_COUNT", f"EOMC_COUNT{name}"),
-        ("fabs_REAL", f"fabs{of.suffix}"),
+        ("fabs_REAL", f"fabs{precision.suffix}"),
         ("EOMC_REAL", real),
         ("eomc_LANE", f"eomc{name}" if name else real),
         ("_LANE", name),
@@ -185,42 +185,48 @@ def over(of: Any, text: str, name: str = "", width: int = 0) -> str:
     return text
 
 
-def source(of: Any) -> str:
-    """All of it, and functions that call it for arrays."""
-    size = np.dtype(of.dtype).itemsize
+def source(precision: Any) -> str:
+    """Return all of them, and functions that call them for arrays."""
+    size = np.dtype(precision.dtype).itemsize
 
     def file(name: str) -> str:
         return (ROOT / "csrc" / "lanes" / f"{name}.h").read_text(encoding="utf-8")
 
-    sincos, rotate = file(f"sincos{of.suffix}"), file(f"rotate{of.suffix}")
-    texts = [over(of, file("scalar") + rotate + ONE + ROTATING)]
+    sincos, rotate = file(f"sincos{precision.suffix}"), file(f"rotate{precision.suffix}")
+    texts = [over(precision, file("scalar") + rotate + ONE + ROTATING)]
     several = file("vector") + sincos + rotate + ROTATING + SEVERAL + file("select")
-    several += file(f"exp{of.suffix}") + file(f"tanh{of.suffix}")
+    several += file(f"exp{precision.suffix}") + file(f"tanh{precision.suffix}")
     several += "".join(EACH.replace("NAME", name) for name in EXPONENTIALS)
-    texts += [over(of, several, name, width) for name, width in VECTORS.items()]
-    texts += [over(of, file("vector"), f"_{n}", k * size) for n, k in (("two", 2), ("four", 4))]
-    return "\n".join([bench.HARNESS, *texts, over(of, file("four") + file("interleave") + FOUR)])
+    texts += [over(precision, several, name, width) for name, width in VECTORS.items()]
+    texts += [
+        over(precision, file("vector"), f"_{n}", k * size) for n, k in (("two", 2), ("four", 4))
+    ]
+    return "\n".join(
+        [bench.HARNESS, *texts, over(precision, file("four") + file("interleave") + FOUR)]
+    )
 
 
 @cache
-def built(folder: Path, of: Any, name: str) -> ctypes.CDLL | None:
-    """The library; None where the compiler does not know the flags."""
-    given = ["-std=gnu99", "-Wno-psabi", *BUILDS[name], *of.flags]
+def built(folder: Path, precision: Any, name: str) -> ctypes.CDLL | None:
+    """Return the library; None if the compiler does not support the flags."""
+    flags = ["-std=gnu99", "-Wno-psabi", *BUILDS[name], *precision.flags]
     try:
-        return bench.build(source(of), name.replace(" ", "_") + of.suffix, folder, given)
+        return bench.build(
+            source(precision), name.replace(" ", "_") + precision.suffix, folder, flags
+        )
     except subprocess.CalledProcessError:
-        if "-mno-fma" not in given:
+        if "-mno-fma" not in flags:
             raise
         return None
 
 
 def call(library: ctypes.CDLL, function: str, *arrays: np.ndarray) -> None:
-    """For all numbers of the arrays, which are as long as the first."""
+    """Call a function for all numbers of the arrays, whose length is that of the first."""
     assert not len(arrays[0]) % MOST
     getattr(library, function)(ctypes.c_long(len(arrays[0])), *map(bench.pointer, arrays))
 
 
 def of_lane(library: ctypes.CDLL, function: str, x: np.ndarray) -> np.ndarray:
-    """A function of one number of them all."""
+    """Return the values of a function of one number, for an array."""
     call(library, function, x, y := np.empty_like(x))
     return y

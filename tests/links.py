@@ -1,4 +1,4 @@
-"""Links and point masses: scenes of them, systems in SymPy, their accelerations by multipliers."""
+"""Links and point masses: scenes, systems in SymPy, their accelerations by multipliers."""
 
 from __future__ import annotations
 
@@ -21,42 +21,42 @@ from eomc.verify.taylor import TaylorReference
 sin, cos = sympy.sin, sympy.cos
 
 
-def made_of(text: str) -> System:
+def read_system(text: str) -> System:
     return from_scene(parse(text, "links.toml"))
 
 
-def by_multipliers(made: System) -> Function:
-    """The acceleration by this route, whichever is the cheapest."""
-    found = link_multipliers.solution(made)
-    return lower("acceleration", found.tape, found.acceleration, checks=found.pivots)
+def by_multipliers(system: System) -> Function:
+    """Return the acceleration by this route, even if another one is cheaper."""
+    solution = link_multipliers.solution(system)
+    return lower("acceleration", solution.tape, solution.acceleration, checks=solution.pivots)
 
 
-def cheapest(made: System) -> tuple[Function, Mapping[str, str]]:
-    """The acceleration by the route that is taken, and why others were not tried."""
-    best, _, passed_over = program.accelerations(RouteInputs(lagrange.derive(made)))
+def cheapest(system: System) -> tuple[Function, Mapping[str, str]]:
+    """Return the acceleration by the selected route, and why other routes were not tried."""
+    best, _, passed_over = program.accelerations(RouteInputs(lagrange.derive(system)))
     return best, passed_over
 
 
 def states(
-    made: System, count: int = 3, seed: int = 11, reach: float = 1.5
+    system: System, count: int = 3, seed: int = 11, reach: float = 1.5
 ) -> list[dict[str, float]]:
-    """Coordinates, velocities, parameters, inputs and time by name, at random."""
+    """Return random coordinates, velocities, parameters, inputs and time by name."""
     random = np.random.default_rng(seed)
     out = []
     for _ in range(count):
-        state = {x.name: random.uniform(-reach, reach) for x in made.q}
-        state |= {x.name: random.uniform(-2, 2) for x in made.qd}
-        state |= {p.name: p.value * random.uniform(0.7, 1.5) for p in made.parameters}
-        state |= {x.name: random.uniform(-1, 1) for x in made.u}
+        state = {x.name: random.uniform(-reach, reach) for x in system.q}
+        state |= {x.name: random.uniform(-2, 2) for x in system.qd}
+        state |= {p.name: p.value * random.uniform(0.7, 1.5) for p in system.parameters}
+        state |= {x.name: random.uniform(-1, 1) for x in system.u}
         out.append({**state, "t": random.uniform(0, 3)})
     return out
 
 
-def independent(made: System, state: Mapping[str, float]) -> tuple[np.ndarray, float]:
-    """The acceleration from the energies' Taylor series, and the condition of D."""
-    q, qd, u = ([state[x.name] for x in xs] for xs in (made.q, made.qd, made.u))
-    params = {p.name: state[p.name] for p in made.parameters}
-    answer = TaylorReference(made)
+def independent(system: System, state: Mapping[str, float]) -> tuple[np.ndarray, float]:
+    """Return the acceleration from the Taylor series of the energies, and the condition of D."""
+    q, qd, u = ([state[x.name] for x in xs] for xs in (system.q, system.qd, system.u))
+    params = {p.name: state[p.name] for p in system.parameters}
+    answer = TaylorReference(system)
     D = answer.evaluate("D", q, qd, state["t"], u, params)
     return answer.acceleration(q, qd, state["t"], u, params), float(np.linalg.cond(D))
 
@@ -68,10 +68,10 @@ def links(
     parents: list[int], equal: bool = True, relative: bool = False, written: bool = False,
     pivot: str = "", more: str = "",
 ) -> str:  # fmt: skip
-    """Point masses on massless links, parents[k] < k the one that link k hangs on, -1: the pivot.
+    """Return point masses on massless links; link k hangs on parents[k] < k, or -1: the pivot.
 
-    equal: one mass and one length for all. relative: angles against the parent's link. written:
-    positions without the parents' names. pivot: where it is, a function of t.
+    equal: one mass and one length for all. relative: angles relative to the parent link. written:
+    positions without the names of parents. pivot: its position, a function of t.
     """
     n = len(parents)
     names = [""] if equal else [str(k) for k in range(n)]
@@ -104,13 +104,13 @@ A_DOT, B_DOT, C_DOT = (symbol(f"{name}_dot") for name in "abc")
 PARAMETERS = {m: 1.3, L: 0.6, R: 0.4, k: 2.0}
 
 
-def hung(from_: tuple[Any, Any], size: Any, angle: Any) -> tuple[Any, Any]:
-    """The position at the end of a link."""
+def link_end(from_: tuple[Any, Any], size: Any, angle: Any) -> tuple[Any, Any]:
+    """Return the position of the end of a link."""
     return from_[0] + size * sin(angle), from_[1] - size * cos(angle)
 
 
 def moving(points: list[tuple[Any, ...]], q: list[Any], more: Any = 0, **others: Any) -> System:
-    """Masses m, 2m, ... with these positions; more: beside their kinetic energy."""
+    """Return masses m, 2m, ... with these positions; more: additional kinetic energy."""
     kinetic = sum((j + 1) * m * sum(dot(e) ** 2 for e in p) / 2 for j, p in enumerate(points))
     potential = others.pop("potential", m * k * sum(p[-1] for p in points))
     return System.make("points", q, kinetic + more, potential, parameters=PARAMETERS, **others)

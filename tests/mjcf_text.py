@@ -14,23 +14,23 @@ from eomc.robots.mjcf import read
 from eomc.robots.robot import Robot
 
 PI = math.pi
-CLOSE = 1e-14  # relative; the numbers below need a few operations each
+CLOSE = 1e-14  # relative; the compared numbers need a few operations each
 
 
 def model(tmp_path: Path, inside: str, before: str = "", after: str = "") -> Robot:
-    """The robot of a text: `inside` <worldbody>, `before` and `after` it."""
+    """Return the robot of a text: `inside` <worldbody>, `before` and `after` it."""
     file = tmp_path / "model.xml"
     file.write_text(f"<mujoco>{before}\n<worldbody>{inside}</worldbody>\n{after}</mujoco>")
     return read.read(file)
 
 
-def imported(folder: Path, text: str, *words: str) -> tuple[str, str]:
-    """What the command says of a robot file, and the scene; "" where there is none."""
+def import_robot(folder: Path, text: str, *words: str) -> tuple[str, str]:
+    """Import a robot file; return the command's output and the scene ("" if there is none)."""
     file, scene = folder / "robot.xml", folder / "robot.toml"
     file.write_text(text, encoding="utf-8")
-    done = CliRunner().invoke(main, ["import", str(file), "--out", str(scene), *words])
-    assert done.exit_code == (0 if scene.exists() else 2), done.output
-    return done.output, scene.read_text(encoding="utf-8") if scene.exists() else ""
+    result = CliRunner().invoke(main, ["import", str(file), "--out", str(scene), *words])
+    assert result.exit_code == (0 if scene.exists() else 2), result.output
+    return result.output, scene.read_text(encoding="utf-8") if scene.exists() else ""
 
 
 def refused(tmp_path: Path, inside: str, before: str = "", after: str = "") -> str:
@@ -44,5 +44,5 @@ BODY = f'<body name="a"><joint name="j"/>{BALL}</body>'
 
 
 def reported(robot: Robot, *words: str) -> bool:
-    """Whether one line of what is left out holds all the words."""
+    """Return True if one line of the report contains all the words."""
     return any(all(word in line for word in words) for line in robot.left_out)

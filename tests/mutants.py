@@ -1,14 +1,14 @@
 """Mutants of the generated C: each changed in one place, compiled, imported and checked.
 
     python tests/mutants.py                     the sample of the slow tests
-    python tests/mutants.py --count 200 chain   so many of one scene or VARIANTS
+    python tests/mutants.py --count 200 chain   a sample of one scene or of VARIANTS
     python tests/mutants.py --all --count 60
 
-Signs, operators, comparisons, factors, constants and indices are changed, at most one at once. A
-mutant is killed where it does not compile, crashes, hangs or fails a row of `eomc check`. Of those
-that pass, equivalent ones compute the same as the original, to the bit, in RUNS random runs and in
-all else that `outcomes` tries, rounding ones the same within ROUNDING of its size; the rest have
-survived, and are printed with their place.
+Changes concern signs, operators, comparisons, factors, constants and indices, one at a time. A
+mutant is killed if it does not compile, crashes, hangs or fails a check of `eomc check`. Of the
+others, equivalent ones give the same bits as the original in RUNS random runs and in all other
+results of `outcomes`, rounding ones the same values within ROUNDING; the rest have survived, and
+are printed with their position.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ from eomc.verify.sampling import State
 FLAGS = ("-O1", "-march=native", "-fno-math-errno", "-fno-trapping-math")
 SECONDS = 60.0
 RUNS = 60
-ROUNDING = 1e-11  # what random runs make of a last digit
+ROUNDING = 1e-11  # amplification of rounding errors in random runs
 
-# a scene of its own name, or one with other lines under [run]
+# a scene, or one with other lines under [run]
 VARIANTS: Mapping[str, tuple[str, str]] = {
     "pendulum_dp8_gauss8": ("double_pendulum", 'method = ["rk4", "dp8", "gauss8"]\n'),
     "cartpole_batch": ("cartpole", "batch = true\n"),
@@ -58,19 +58,19 @@ DIVERSE = (
 
 
 def variant(name: str) -> System:
-    """A scene, or one of VARIANTS, as a system, its start assembled."""
+    """Return a scene or one of VARIANTS as a system, with assembled initial state."""
     base, more = VARIANTS.get(name, (name, ""))
     text = (SCENES / f"{base}.toml").read_text(encoding="utf-8")
-    made = from_scene(parse(text.replace("[run]\n", "[run]\n" + more), f"{name}.toml"))
-    return assembled(made)
+    system = from_scene(parse(text.replace("[run]\n", "[run]\n" + more), f"{name}.toml"))
+    return assembled(system)
 
 
-# --- what a module computes -----------------------------------------------------------------------
+# --- results of a module --------------------------------------------------------------------------
 
 
 def outcomes(module: Any, check: Any) -> Vector:
-    """What the module gives in RUNS random runs, at their states, and in a batch."""
-    found: list[Vector] = []
+    """Return the results of RUNS random runs, of functions at their states, and of a batch."""
+    results: list[Vector] = []
     model = model_of(module)
     draw = np.random.default_rng(99)
     names = ("D", "C", "g", "bias", "tau", "kinetic_energy", "potential_energy", "energy", "jacobi",
@@ -81,33 +81,33 @@ def outcomes(module: Any, check: Any) -> Vector:
         near = 1 + 0.3 * draw.standard_normal((2, len(s.q)))
         at = State(s.q * near[0], s.qd * near[1], s.t, s.u, s.params)
         for name in names:
-            found.append(check.module_value(name, at))
+            results.append(check.module_value(name, at))
         for method in module.methods:
             h = check.system.run.h * float(np.exp(draw.uniform(-3, 2)))
             for cuts in ((3, 17), ()):
                 division = RunDivision(cuts)
                 run = run_in_c(model, method, at, h, 30, every=1 + n % 3, division=division)
-                found += [run.rows, np.array([run.status, run.steps])]
+                results += [run.rows, np.array([run.status, run.steps])]
     if hasattr(module, "simulate_batch"):
         q, qd = (np.array([getattr(e.state, x) for e in states] * 9) for x in ("q", "qd"))
         qd = qd * np.exp(draw.uniform(-2, 6, (len(q), 1)))
         for method in module.methods:
             runs = module.simulate_batch(q, qd, steps=30, every=7, method=method, threads=1)
-            found += [runs.q, runs.qd, runs.status_codes]
-    return np.concatenate([np.asarray(x, float).ravel() for x in found])
+            results += [runs.q, runs.qd, runs.status_codes]
+    return np.concatenate([np.asarray(x, float).ravel() for x in results])
 
 
 class Bench:
-    """One scene whose reference is made once; mutants are checked in forks of this process."""
+    """A scene whose reference is derived once; mutants are checked in forked processes."""
 
-    def __init__(self, name: str, folder: Path, made: System | None = None) -> None:
-        self.system = variant(name) if made is None else made
+    def __init__(self, name: str, folder: Path, system: System | None = None) -> None:
+        self.system = variant(name) if system is None else system
         self.shipped = Shipped(self.system, folder / name)
         self.reference = comparison.reference_for(self.system)
-        comparison.reference_for = lambda made: self.reference
+        comparison.reference_for = lambda system: self.reference
         self.mutants = of_c(self.shipped.source)
-        # What the reference compiles for itself is there in all forks then. A library that was
-        # loaded once is not loaded again, so that the original has a place of its own.
+        # All forked processes then share what the reference has compiled for itself. The original
+        # has its own folder, because a loaded library cannot be loaded again.
         own = Shipped(self.system, folder / f"{name}_original")
         assert own.compile(FLAGS) is None and self.shipped.compile(FLAGS) is None
         original = own.load()
@@ -118,14 +118,14 @@ class Bench:
 
     @property
     def right(self) -> Vector:
-        """What the original computes."""
+        """Return the results of the original."""
         if self._right is None:
             assert self.shipped.compile(FLAGS) is None
             self._right = self.outcome()
         return self._right
 
     def outcome(self) -> Vector:
-        """What is now compiled computes; nothing where it ends otherwise."""
+        """Return the results of the compiled mutant; empty if it terminates."""
         file = self.shipped.folder / "outcome.npy"
         file.unlink(missing_ok=True)
         in_a_fork(lambda: np.save(file, self._outcome()), SECONDS)
@@ -137,16 +137,16 @@ class Bench:
         return outcomes(module, self.states)
 
     def _passed(self) -> str:
-        """What a mutant is that passes the check."""
-        found = self.outcome()
+        """Classify a mutant that passes the check."""
+        result = self.outcome()
         right = self.right
-        if np.array_equal(found, right, equal_nan=True):
+        if np.array_equal(result, right, equal_nan=True):
             return "equivalent"
-        if found.shape != right.shape:
+        if result.shape != right.shape:
             return "survived"
         with np.errstate(all="ignore"):
-            same = (found == right) | (np.isnan(found) & np.isnan(right))
-            near = np.abs(found - right) <= ROUNDING * (1 + np.abs(right))
+            same = (result == right) | (np.isnan(result) & np.isnan(right))
+            near = np.abs(result - right) <= ROUNDING * (1 + np.abs(right))
         return "rounding" if np.all(same | near) else "survived"
 
     def _check(self) -> list[str]:
@@ -154,9 +154,9 @@ class Bench:
         return [row.name for row in report.results if not row.passed]
 
     def judge(self, mutant: Mutant) -> tuple[str, str]:
-        """killed, survived or equivalent, and by what."""
-        said = self.shipped.compile(FLAGS, mutant.of(self.shipped.source))
-        if said is not None:
+        """Return killed, survived or equivalent, and the cause."""
+        message = self.shipped.compile(FLAGS, mutant.apply(self.shipped.source))
+        if message is not None:
             return "no C", ""
         kind, value = in_a_fork(self._check, SECONDS)
         if kind != "done":
@@ -167,20 +167,20 @@ class Bench:
         return self._passed(), ""
 
     def place(self, mutant: Mutant) -> str:
-        """Where, and what."""
+        """Return the position and the change."""
         source = self.shipped.source
         line = source.count("\n", 0, mutant.at) + 1
         start = source.rfind("\n", 0, mutant.at) + 1
         end = source.find("\n", mutant.at)
         old = source[mutant.at : mutant.end]
-        text = mutant.of(source)[start : end + len(mutant.new) - len(old)].strip()
+        text = mutant.apply(source)[start : end + len(mutant.new) - len(old)].strip()
         return f"{line}: {old!r} -> {mutant.new!r}: {text}"
 
 
 def tried(
     name: str, count: int, seed: int, folder: Path, loud: bool = True
 ) -> tuple[dict[str, int], list[str]]:
-    """How many of a sample were killed and so on, and the places of those that have survived."""
+    """Return the number of mutants by result in a sample, and the positions of survivors."""
     bench = Bench(name, folder)
     sample = random.Random(seed).sample(bench.mutants, min(count, len(bench.mutants)))
     counts = dict.fromkeys(("killed", "survived", "equivalent", "rounding", "no C"), 0)
@@ -193,25 +193,25 @@ def tried(
         if verdict == "survived":
             survived.append(bench.place(mutant))
     if loud:
-        told = ", ".join(f"{n} {what}" for what, n in counts.items())
-        print(f"{name}: {len(bench.mutants)} mutants, of {len(sample)} {told}", flush=True)
+        summary = ", ".join(f"{n} {what}" for what, n in counts.items())
+        print(f"{name}: {len(bench.mutants)} mutants, of {len(sample)} {summary}", flush=True)
     return counts, survived
 
 
 def main(arguments: Sequence[str]) -> int:
-    """The command."""
+    """Run the command."""
     parser = argparse.ArgumentParser(description="Mutants of the generated C, checked.")
     parser.add_argument("scenes", nargs="*", help="of scenes/, or of VARIANTS")
     parser.add_argument("--count", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--all", action="store_true", help=" ".join(DIVERSE))
-    given = parser.parse_args(arguments)
-    names = DIVERSE if given.all else given.scenes or ["cartpole", "chain"]
+    options = parser.parse_args(arguments)
+    names = DIVERSE if options.all else options.scenes or ["cartpole", "chain"]
     total: dict[str, int] = {}
     with tempfile.TemporaryDirectory() as folder:
         for name in names:
             # each in a process of its own: modules of one name, references of another
-            one = partial(tried, name, given.count, given.seed, Path(folder))
+            one = partial(tried, name, options.count, options.seed, Path(folder))
             kind, value = in_a_fork(one, 36_000)
             if kind != "done":
                 print(f"{name}: {kind}: {value}")

@@ -1,11 +1,11 @@
-"""Modules with one term negated, and whether that changes what they compute.
+"""Modules with one term negated, and whether that changes their results.
 
 Either a term of the program: in one assignment of one function (D, the acceleration, an energy, a
-signal, ...) one term of a sum, a product or an argument takes the other sign. Or a coefficient of
-a stepper: an entry of its tableau, and of rk4, which is written out by hand, one sign of its text.
-Changed is a module where a function or a step at random states differs by more than SEEN of its
-size from the right module's; what is changed by less, or where no state was finite, counts as not
-changed: no check can be asked to see it.
+signal, ...) one term of a sum, a product or an argument changes its sign. Or a coefficient of a
+method: an entry of its tableau, or for rk4, which is handwritten, one sign of its text. A module is
+changed if a function or a step at random states differs by more than DETECTABLE, relative to its
+size, from the correct module; otherwise, or if no state was finite, it counts as unchanged, because
+no check can detect it.
 """
 
 from __future__ import annotations
@@ -29,62 +29,66 @@ from eomc.program import program
 from eomc.program.ir import Assignment, Call, Function, Product, Sum
 from eomc.program.program import Program
 
-SEEN = 1e-7
+DETECTABLE = 1e-7
 FUNCTIONS = (
     "D C g bias tau kinetic_energy potential_energy energy jacobi power acceleration".split()
 )
 
 
 def negated_sources(system: System, extension: str, seed: int) -> tuple[Sources, str]:
-    """The sources with one term negated, and which one, in words."""
+    """Return the sources with one term negated, and a description of the term."""
     choice = random.Random(f"negate {seed}")
-    made = program.build(lagrange.derive(system))
+    program_of_system = program.build(lagrange.derive(system))
     method = choice.choice(system.run.methods)
     if choice.random() < 0.35 and system.run.real == "double":
         if method == "rk4":
-            return _text(render.render(made, extension), choice)
+            return _text(render.render(program_of_system, extension), choice)
         wrong, what = _coefficient(METHODS[method], choice)
-        with _as(wrong):
-            return render.render(made, extension), what
-    wrong_program, what = _term(made, choice)
+        with _replace_method(wrong):
+            return render.render(program_of_system, extension), what
+    wrong_program, what = _term(program_of_system, choice)
     return render.render(wrong_program, extension), what
 
 
 # --- a term of the program ------------------------------------------------------------------------
 
 
-def _term(made: Program, choice: random.Random) -> tuple[Program, str]:
-    """The program with one term negated; an acceleration's as often as all others' together."""
+def _term(program_of_system: Program, choice: random.Random) -> tuple[Program, str]:
+    """Return the program with one term negated; half of the time in the acceleration."""
     places = [
         (name, part, k)
-        for name, f in made.functions.items()
+        for name, f in program_of_system.functions.items()
         for part in ("early", "body")
         for k, a in enumerate(getattr(f, part))
         if any(True for _ in _negations(a))
     ]
     first = [place for place in places if place[0] == "acceleration"]
     if not places:
-        name = choice.choice(sorted(n for n, f in made.functions.items() if f.outputs))
-        f = made.functions[name]
+        name = choice.choice(sorted(n for n, f in program_of_system.functions.items() if f.outputs))
+        f = program_of_system.functions[name]
         k = choice.randrange(len(f.outputs))
         outputs = tuple(
             replace(o, coefficient=-o.coefficient) if i == k else o for i, o in enumerate(f.outputs)
         )
-        return _with(made, replace(f, outputs=outputs)), f"output {k} of {name}"
+        return _replace_function(
+            program_of_system, replace(f, outputs=outputs)
+        ), f"output {k} of {name}"
     name, part, k = choice.choice(first if first and choice.random() < 0.5 else places)
-    f = made.functions[name]
+    f = program_of_system.functions[name]
     lines = list(getattr(f, part))
     where, lines[k] = choice.choice(list(_negations(lines[k])))
     changed: Function = replace(f, **{part: tuple(lines)})
-    return _with(made, changed), f"{where} of {lines[k].name} in {name}"
+    return _replace_function(program_of_system, changed), f"{where} of {lines[k].name} in {name}"
 
 
-def _with(made: Program, changed: Function) -> Program:
-    return replace(made, functions={**made.functions, changed.name: changed})
+def _replace_function(program_of_system: Program, changed: Function) -> Program:
+    return replace(
+        program_of_system, functions={**program_of_system.functions, changed.name: changed}
+    )
 
 
 def _negations(a: Assignment) -> Iterator[tuple[str, Assignment]]:
-    """Each way to negate one term of a right-hand side."""
+    """Yield each way to negate one term of a right-hand side."""
     v = a.value
     if isinstance(v, Sum):
         for i, (x, name) in enumerate(v.terms):
@@ -100,11 +104,11 @@ def _negations(a: Assignment) -> Iterator[tuple[str, Assignment]]:
             yield f"argument {i}", replace(a, value=replace(v, args=args))
 
 
-# --- a coefficient of a stepper -------------------------------------------------------------------
+# --- a coefficient of a method --------------------------------------------------------------------
 
 
 def _coefficient(m: Method, choice: random.Random) -> tuple[Method, str]:
-    """The method with one entry of A or b negated, the times of its stages unchanged."""
+    """Return the method with one entry of A or b negated, and unchanged stage times."""
     fields: dict[str, list[list[Fraction]]] = {
         "a": [list(row) for row in m.a], "b": [list(m.b)], "end": [list(m.end)],
     }  # fmt: skip
@@ -125,8 +129,8 @@ def _coefficient(m: Method, choice: random.Random) -> tuple[Method, str]:
 
 
 @contextmanager
-def _as(wrong: Method) -> Iterator[None]:
-    """While a source is printed, the method is the wrong one."""
+def _replace_method(wrong: Method) -> Iterator[None]:
+    """Use the wrong method while a source is rendered."""
     right = METHODS[wrong.name]
     METHODS[wrong.name] = wrong  # type: ignore[index]
     try:
@@ -138,22 +142,22 @@ def _as(wrong: Method) -> Iterator[None]:
 _SIGN = re.compile(r"(?<=[\w)\]]) ([+-])(?==? [\w(])")
 
 
-def _text(made: Sources, choice: random.Random) -> tuple[Sources, str]:
-    """One `+` or `-` in the lines of rk4's step that add up states and accelerations."""
-    name = f"fast/{made.name}.c"
-    text = made.files[name]
-    parts = rf"^[^\n;]*{made.name}_rk4_(?:position|stage|end)\(.*?\n}}\n"
+def _text(sources: Sources, choice: random.Random) -> tuple[Sources, str]:
+    """Negate one `+` or `-` in the lines of rk4's step that sum states and accelerations."""
+    name = f"fast/{sources.name}.c"
+    text = sources.files[name]
+    parts = rf"^[^\n;]*{sources.name}_rk4_(?:position|stage|end)\(.*?\n}}\n"
     spans = [part.span() for part in re.finditer(parts, text, re.M | re.S)]
     signs = [s for span in spans for s in _SIGN.finditer(text, *span) if _adds(text, s)]
     sign = choice.choice(signs)
     other = "-" if sign[1] == "+" else "+"
     wrong = text[: sign.start(1)] + other + text[sign.end(1) :]
     line = text[text.rindex("\n", 0, sign.start()) : text.index("\n", sign.end())].strip()
-    return replace(made, files={**made.files, name: wrong}), f"a sign of rk4: {line}"
+    return replace(sources, files={**sources.files, name: wrong}), f"a sign of rk4: {line}"
 
 
 def _adds(text: str, sign: re.Match[str]) -> bool:
-    """Whether it stands in a sum of the method itself, not in what is left of rounding."""
+    """Return whether the sign is in a sum of the method itself, not of compensated rounding."""
     line = text[text.rindex("\n", 0, sign.start()) : text.index("\n", sign.end())]
     return "h_rest" not in line and "/*" not in line and "for" not in line
 
@@ -162,7 +166,7 @@ def _adds(text: str, sign: re.Match[str]) -> bool:
 
 
 def changes(right: Any, wrong: Any, seed: int) -> bool:
-    """Whether a function or a step of the two modules differs by more than SEEN at some state."""
+    """Return whether a function or step of the modules differs by more than DETECTABLE."""
     draw = np.random.default_rng(seed)
     q0, qd0 = right.start
     for k in range(12):
@@ -170,13 +174,13 @@ def changes(right: Any, wrong: Any, seed: int) -> bool:
         q = q0 + spread * draw.uniform(-1, 1, q0.shape)
         qd = qd0 + (spread or 0.1) * draw.uniform(-1, 1, q0.shape)
         t = float(draw.uniform(0, 1))
-        for ask in (*map(_value, FUNCTIONS), _slopes, _more, *map(_step, right.methods)):
+        for ask in (*map(_value, FUNCTIONS), _slopes, _sensitivity, *map(_step, right.methods)):
             one, other = (_try(ask, m, q, qd, t) for m in (right, wrong))
             if one is None or not np.all(np.isfinite(one)):
                 continue
             if other is None or not np.all(np.isfinite(other)):
                 return True
-            if np.max(np.abs(one - other)) > SEEN * (np.max(np.abs(one)) + 1e-300):
+            if np.max(np.abs(one - other)) > DETECTABLE * (np.max(np.abs(one)) + 1e-300):
                 return True
     return False
 
@@ -187,7 +191,7 @@ Ask = Callable[[Any, Any, Any, float], Any]
 def _try(ask: Ask, module: Any, q: Any, qd: Any, t: float) -> Any:
     try:
         return np.asarray(ask(module, q, qd, t), float)
-    except (ArithmeticError, ValueError):  # no such value there, or none that was asked for
+    except (ArithmeticError, ValueError):  # no such value, or none was requested
         return None
 
 
@@ -201,7 +205,7 @@ def _slopes(m: Any, q: Any, qd: Any, t: float) -> Any:
     return np.hstack([A, B]) if B.size else A
 
 
-def _more(m: Any, q: Any, qd: Any, t: float) -> Any:
+def _sensitivity(m: Any, q: Any, qd: Any, t: float) -> Any:
     return m.sensitivity(q, qd, t=t)
 
 

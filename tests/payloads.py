@@ -1,7 +1,7 @@
-"""Texts that would do harm, and a scene to put them in, for the tests of free text.
+"""Texts that would do harm if executed, and a scene to put them in, for tests of free text.
 
-A payload that ran would make the file CANARY. `HIDDEN` ones are refused by the reader and shown
-escaped elsewhere; `PLAIN` ones stand as they are.
+An executed payload would create the file CANARY. `HIDDEN` ones are refused by the reader and
+escaped elsewhere; `PLAIN` ones are shown unchanged.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ HIDDEN = {
 }
 PAYLOADS = {**PLAIN, **HIDDEN}
 ORDINARY = "Κάρρο-εκκρεμές, «é» 30° θ₁ ẋ – m/s² 力 🙂 a\u200db: 'x' \"y\" 50 % #1 C:\\x [m] {} ?"
-# one of a kind
+# one of each kind
 FEW = [
     PAYLOADS[name]
     for name in (
@@ -102,7 +102,7 @@ RAW = re.compile(
 
 @contextmanager
 def nothing_ran() -> Iterator[None]:
-    """No payload is executed meanwhile."""
+    """No payload is executed during the test."""
     CANARY.parent.mkdir(parents=True, exist_ok=True)
     CANARY.unlink(missing_ok=True)
     try:
@@ -165,14 +165,14 @@ duration = 0.1
 
 
 def quoted(text: str) -> str:
-    """A text in TOML's quotes, nothing of it cleaned."""
+    """Return a text in TOML quotes, unchanged."""
     written = json.dumps(text, ensure_ascii=False).replace("\x7f", r"\u007f")
-    return re.sub(r"[\ud800-\udfff]", lambda found: rf"\u{ord(found[0]):x}", written)
+    return re.sub(r"[\ud800-\udfff]", lambda match: rf"\u{ord(match[0]):x}", written)
 
 
 def fields() -> list[tuple[int, str]]:
-    """Which @ of SCENE is which key."""
-    where, found = "", []
+    """Return the line and the key of each @ in SCENE."""
+    where, result = "", []
     counts = {"body": "cart", "point": "tip", "force": "1"}
     counts |= {"spring": "1", "damper": "1", "event": "1"}
     for text in SCENE.splitlines():
@@ -181,52 +181,52 @@ def fields() -> list[tuple[int, str]]:
             where += "." + counts[where] if text.startswith("[[") else ""
         for key in re.findall(r'(\w+) = "@"', text):
             inside = text.split(" = {")[0] if "{" in text else ""
-            found.append(".".join(part for part in (where, inside, key) if part))
-    return list(enumerate(found))
+            result.append(".".join(part for part in (where, inside, key) if part))
+    return list(enumerate(result))
 
 
-def filled(given: dict[int, str]) -> str:
-    """SCENE with texts in some of its fields."""
+def filled(texts: dict[int, str]) -> str:
+    """Return SCENE with texts in some of its fields."""
     k = iter(range(100))
-    return re.sub('"@"', lambda _: quoted(given.get(next(k), "plain")), SCENE)
+    return re.sub('"@"', lambda _: quoted(texts.get(next(k), "plain")), SCENE)
 
 
 @cache
 def derived() -> Program:
-    made = from_scene(parse(SCENE.replace('"@"', '""'), "f.toml"))
-    return program.build(lagrange.derive(made))
+    system = from_scene(parse(SCENE.replace('"@"', '""'), "f.toml"))
+    return program.build(lagrange.derive(system))
 
 
-def with_texts(made: System, text: str, file: str | None = None) -> System:
-    """The system with a text wherever one can be."""
+def with_texts(system: System, text: str, file: str | None = None) -> System:
+    """Return the system with a text in every possible field."""
     return replace(
-        made,
+        system,
         title=text,
         note=text,
         file=text if file is None else file,
         renamed=((text, "x"),),
-        coordinates=tuple(replace(c, unit=text, note=text) for c in made.coordinates),
-        parameters=tuple(replace(p, unit=text, note=text) for p in made.parameters),
-        inputs=tuple(replace(i, unit=text, note=text) for i in made.inputs),
-        outputs=tuple(replace(o, unit=text, note=text) for o in made.outputs),
-        events=tuple(replace(e, unit=text, note=text) for e in made.events),
+        coordinates=tuple(replace(c, unit=text, note=text) for c in system.coordinates),
+        parameters=tuple(replace(p, unit=text, note=text) for p in system.parameters),
+        inputs=tuple(replace(i, unit=text, note=text) for i in system.inputs),
+        outputs=tuple(replace(o, unit=text, note=text) for o in system.outputs),
+        events=tuple(replace(e, unit=text, note=text) for e in system.events),
     )
 
 
 def generated(text: str, file: str | None = None) -> dict[str, str]:
     whole = derived()
-    made = replace(whole, system=with_texts(whole.system, text, file))
-    return dict(render.render(made, "_extension").files)
+    program_with_text = replace(whole, system=with_texts(whole.system, text, file))
+    return dict(render.render(program_with_text, "_extension").files)
 
 
 def tokens(files: dict[str, str], folder: Path) -> str:
-    """What a C compiler sees of the C files."""
+    """Return the preprocessed C files."""
     names = [name for name in files if name.endswith((".c", ".h"))]
     for name in names:
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text(files[name], encoding="utf-8")
     command = [needs("gcc"), "-E", "-P", "-Wcomment", "-Wtrigraphs", "-Werror"]
     command += ["-std=c99", "-I.", "-x", "c"]
-    done = subprocess.run([*command, *names], cwd=folder, capture_output=True, text=True)
-    assert done.returncode == 0 and not done.stderr, done.stderr
-    return done.stdout
+    process = subprocess.run([*command, *names], cwd=folder, capture_output=True, text=True)
+    assert process.returncode == 0 and not process.stderr, process.stderr
+    return process.stdout

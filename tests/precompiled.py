@@ -1,4 +1,4 @@
-"""What saves time where modules are compiled for tests: headers compiled once, nothing inlined."""
+"""Faster compilation of modules for tests: precompiled headers, no inlining."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cases import SCENES
 
 from eomc.toolchain import compiler
 
-# what cffi's text has before its own, which then finds all of it there
+# The beginning of cffi's text, which then finds all of it precompiled.
 HEADER = """
 #define _CFFI_
 #include <pyconfig.h>
@@ -31,9 +31,9 @@ HEADER = """
 #undef _CFFI_
 #undef Py_LIMITED_API
 """
-# a third of the time goes into functions that have to be inlined: to compilers they have not
+# A third of the time is spent on functions that compilers are required to inline.
 UNOPTIMISED = ("-O0", "-Dalways_inline=unused")
-# what cffi writes for each argument that is an array; of one function for all of them half the time
+# The code of cffi for each array argument; one function for all of them takes half the time.
 ARRAY = re.compile(
     r"""  datasize = _cffi_prepare_pointer_call_argument\(
       (_cffi_type\(\d+\)), (arg\d+), \(char \*\*\)&(x\d+)\);
@@ -59,11 +59,11 @@ static int array_argument(struct _cffi_ctypedescr *type, PyObject *given, char *
   return _cffi_convert_array_argument(type, given, x, datasize, to_free);
 }
 """
-# functions that only call another one of the same arguments, whose address serves as well
+# Functions that only call another one with the same arguments, whose address can be used instead.
 DIRECT = re.compile(
     r"^static [^\n;]*?_cffi_d_(\w+)\([^\n]*\)\n\{\n  (?:return )?\1\([^\n]*\);\n\}\n", re.M
 )
-# a call from Python, which differs from those of functions of one type by the name alone
+# A call from Python, which differs only by the name from that of functions of the same type.
 WRAPPER = re.compile(
     r"^static PyObject \*\n_cffi_f_(\w+)\(PyObject \*self, PyObject \*args\)\n\{\n(.*?)^\}\n",
     re.M | re.S,
@@ -82,8 +82,8 @@ _cffi_f_{name}(PyObject *self, PyObject *args)
 FLAGS = ("-fPIC", "-fvisibility=hidden", compiler.STANDARD, "-DNDEBUG", "-O0")
 
 
-def shortened(binding: str) -> str:
-    """What cffi has written, which does the same, compiled in two thirds of the time at -O0."""
+def shorten_binding(binding: str) -> str:
+    """Return an equivalent of cffi's binding that compiles in two thirds of the time at -O0."""
     first = DIRECT.search(binding)
     if first is None:
         return binding
@@ -96,15 +96,15 @@ def shortened(binding: str) -> str:
 
 
 def _shared(functions: str) -> str:
-    """With one function for all wrappers that do the same by another name."""
-    made: dict[str, str] = {}
+    """Merge all wrappers that differ by the name only into one function."""
+    shared_names: dict[str, str] = {}
 
-    def short(found: re.Match[str]) -> str:
-        name, body = found.groups()
+    def short(match: re.Match[str]) -> str:
+        name, body = match.groups()
         body = body.replace(f'args, "{name}", ', "args, name, ")
         body = re.sub(rf"(\{{ (?:result = )?){name}\(", r"\1function(", body)
-        new = body not in made
-        shared = made.setdefault(body, f"wrapper_{len(made)}")
+        new = body not in shared_names
+        shared = shared_names.setdefault(body, f"wrapper_{len(shared_names)}")
         wrapper = SHORT.format(name=name, shared=shared)
         return SHARED.format(name=name, shared=shared, body=body) + wrapper if new else wrapper
 
@@ -112,24 +112,24 @@ def _shared(functions: str) -> str:
 
 
 @cache
-def included() -> tuple[str, ...]:
-    """Flags of gcc that take a third from the compilation of a binding at -O0; none of others."""
+def precompiled_header_flags() -> tuple[str, ...]:
+    """Return gcc flags that save a third of a binding's compilation at -O0; none for others."""
     if os.environ.get("CC") or sys.platform != "linux":
         return ()
-    found = compiler.find_compiler()
-    if "gcc" not in Path(found.command[0]).resolve().name:
+    c_compiler = compiler.find_compiler()
+    if "gcc" not in Path(c_compiler.command[0]).resolve().name:
         return ()
-    parts = (HEADER, *FLAGS, found.identity, sys.version, sys.prefix)
+    parts = (HEADER, *FLAGS, c_compiler.identity, sys.version, sys.prefix)
     name = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
     folder = SCENES.parent / "build" / "tests" / "precompiled"
-    header, made = folder / f"{name}.h", folder / f"{name}.h.gch"
-    if not made.exists():
+    header, precompiled = folder / f"{name}.h", folder / f"{name}.h.gch"
+    if not precompiled.exists():
         folder.mkdir(parents=True, exist_ok=True)
         new = folder / f"{name}.{os.getpid()}"
         new.write_text(HEADER, encoding="utf-8")
         os.replace(new, header)
         include = {sysconfig.get_path("include"), sysconfig.get_path("platinclude")}
         words = [*FLAGS, *(f"-I{p}" for p in include), "-x", "c-header", str(header)]
-        subprocess.run([*found.command, *words, "-o", str(new)], check=True)
-        os.replace(new, made)
+        subprocess.run([*c_compiler.command, *words, "-o", str(new)], check=True)
+        os.replace(new, precompiled)
     return ("-include", str(header))

@@ -1,7 +1,7 @@
-"""What the check says of random valid scenes.
+"""Check random valid scenes.
 
-python tests/random_scenes.py --count 2000            right modules must pass
-python tests/random_scenes.py --count 300 --negate    with one term negated they must not
+python tests/random_scenes.py --count 2000            correct modules must pass
+python tests/random_scenes.py --count 300 --negate    modules with a negated term must fail
 python tests/random_scenes.py --wide --count 500      with outputs, events, loops and so on
 python tests/random_scenes.py --show 7                the scene of that number
 """
@@ -45,16 +45,17 @@ from eomc.verify.check import check
 
 ROOT = Path(__file__).parent.parent / "build" / "random"
 EXTENSION = "_extension"
-JUDGES = ("order of", "h of", "power balance", "beside")  # rows that may say they can't judge
+# checks that may report that they cannot judge
+JUDGES = ("order of", "h of", "power balance", "beside")
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of one scene: "passed", "false alarm", "not built", "no start", "check raised"; where a term
-    is negated "caught", "wrong pass", "unchanged" or, where the build itself refused, "refused".
+    """Result for one scene: "passed", "false alarm", "not built", "no start", "check raised"; with
+    a negated term "caught", "wrong pass", "unchanged" or, if the build itself failed, "refused".
 
-    rows: those that failed, with what was found. unjudged: those that said they judge nothing.
-    judged: how many rows about orders, steps and balances did.
+    rows: failed checks, with their values. unjudged: checks that could not judge. judged: number of
+    checks of orders, steps and balances.
     """
 
     seed: int
@@ -67,25 +68,25 @@ class Outcome:
 
 
 def outcome(seed: int, negate: bool, root: Path, wide: bool = False) -> Outcome:
-    """The scene of that number derived, built under `root` and checked."""
+    """Derive the scene of that number, build it under `root` and check it."""
     began = time.perf_counter()
-    made, module, plain = None, None, None
+    system, module, plain = None, None, None
     try:
         text = (wide_text if wide else scene_text)(seed)
-        made = from_scene(parse(text, f"{seed}.toml"))
+        system = from_scene(parse(text, f"{seed}.toml"))
         try:
-            made = assembled(made)
-        except SceneError as fault:  # a loop that can't close from there, rightly
+            system = assembled(system)
+        except SceneError as fault:  # a loop that cannot be closed
             return Outcome(seed, "no start", _words(fault))
-        sources = eomc.sources(made, EXTENSION)
+        sources = eomc.sources(system, EXTENSION)
         module = built(sources, root / "right")
-        if not negate:  # what is wrong is to be seen without a right one beside it
+        if not negate:  # the error must be detected without a correct module for comparison
             plain = built(sources, root / "plain", "plain")
     except Exception as fault:
         return Outcome(seed, "not built", _words(fault))
     what = ""
     if negate:
-        right, (sources, what) = module, negated.negated_sources(made, EXTENSION, seed)
+        right, (sources, what) = module, negated.negated_sources(system, EXTENSION, seed)
         try:
             module = built(sources, root / "wrong")
         except EomcError as fault:  # such as a D that is not positive definite
@@ -93,7 +94,7 @@ def outcome(seed: int, negate: bool, root: Path, wide: bool = False) -> Outcome:
         if not negated.changes(right, module, seed):
             return Outcome(seed, "unchanged", what)
     try:
-        report = check(made, module, plain=plain, seed=seed)
+        report = check(system, module, plain=plain, seed=seed)
     except Exception as fault:
         return Outcome(seed, "check raised", _words(fault))
     verdict = ("caught", "wrong pass") if negate else ("false alarm", "passed")
@@ -114,11 +115,11 @@ def _words(fault: Exception) -> str:
 
 
 def built(
-    sources: Sources, folder: Path, form: str = "fast", kept: Path | None = None
+    sources: Sources, folder: Path, form: str = "fast", cache: Path | None = None
 ) -> ModuleType:
-    """The module of a form of these sources, as a build makes it, its binding not optimised.
+    """Build a module of one form of these sources, with a binding that is not optimised.
 
-    kept: a folder of what was compiled from the same C before.
+    cache: a folder with earlier compilations of the same C.
     """
     folder.mkdir(parents=True)
     for file, text in sources.files.items():
@@ -129,19 +130,19 @@ def built(
     ffi = cffi.FFI()
     ffi.cdef(sources.cdef)
     ffi.set_source(EXTENSION, sources.binding)
-    with redirect_stdout(io.StringIO()):  # it tells of itself
+    with redirect_stdout(io.StringIO()):  # suppresses its output
         ffi.emit_c_code(str(folder / "binding.c"))
     flags = [compiler.standard(form), *compiler.flags()]
     texts = [(file.name, file.read_text()) for file in sorted(folder.glob("*.[ch]"))]
     digest = hashlib.sha256(repr((flags, texts)).encode()).hexdigest()
     library = folder / f"{EXTENSION}{sysconfig.get_config_var('EXT_SUFFIX')}"
-    if kept is not None and (kept / digest).exists():
-        shutil.copy(kept / digest, library)
+    if cache is not None and (cache / digest).exists():
+        shutil.copy(cache / digest, library)
     else:
         _compile(sources.name, flags, library)
-        if kept is not None:
-            kept.mkdir(exist_ok=True)
-            shutil.copy(library, kept / digest)
+        if cache is not None:
+            cache.mkdir(exist_ok=True)
+            shutil.copy(library, cache / digest)
     name = f"_random_{hashlib.sha256(str(folder).encode()).hexdigest()}"
     spec = importlib.util.spec_from_file_location(
         name, folder / "__init__.py", submodule_search_locations=[str(folder)]
@@ -160,15 +161,15 @@ def _compile(name: str, flags: Sequence[str], library: Path) -> None:
         ["-shared", "binding.o", f"{name}.o", "-lm", "-o", library.name],
     ):
         command = [*compiler.find_compiler().command, "-fPIC", *words]
-        done = subprocess.run(
+        process = subprocess.run(
             command, cwd=library.parent, capture_output=True, text=True, check=False
         )
-        if done.returncode:
-            raise EomcError(done.stderr)
+        if process.returncode:
+            raise EomcError(process.stderr)
 
 
 def _one(task: tuple[int, bool, bool]) -> Outcome:
-    """For a process of a pool: nothing of the build is left."""
+    """Handle a task in a process of a pool; remove the build."""
     os.environ.setdefault("EOMC_CFLAGS", "-O1")
     warnings.simplefilter("ignore")
     ROOT.mkdir(parents=True, exist_ok=True)
@@ -178,35 +179,35 @@ def _one(task: tuple[int, bool, bool]) -> Outcome:
 
 
 def main() -> int:
-    """1 where something right failed, or something wrong passed."""
-    asked = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    asked.add_argument("--count", type=int, default=100)
-    asked.add_argument("--seed", type=int, default=0, help="the number of the first scene")
-    asked.add_argument("--negate", action="store_true", help="negate one term of each")
-    asked.add_argument("--wide", action="store_true", help="those of scene_author_wide")
-    asked.add_argument("--jobs", type=int, default=1)
-    asked.add_argument("--log", type=Path, help="a line of JSON for each scene")
-    asked.add_argument("--show", type=int, metavar="N", help="print the scene of that number")
-    given = asked.parse_args()
-    if given.show is not None:
-        print((wide_text if given.wide else scene_text)(given.show), end="")
+    """Return 1 if a correct module failed or a wrong one passed."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--count", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0, help="the number of the first scene")
+    parser.add_argument("--negate", action="store_true", help="negate one term of each")
+    parser.add_argument("--wide", action="store_true", help="those of scene_author_wide")
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--log", type=Path, help="a line of JSON for each scene")
+    parser.add_argument("--show", type=int, metavar="N", help="print the scene of that number")
+    options = parser.parse_args()
+    if options.show is not None:
+        print((wide_text if options.wide else scene_text)(options.show), end="")
         return 0
-    tasks = [(given.seed + k, given.negate, given.wide) for k in range(given.count)]
+    tasks = [(options.seed + k, options.negate, options.wide) for k in range(options.count)]
     counts: Counter[str] = Counter()
     unjudged: Counter[str] = Counter()
     judged = 0
     context = multiprocessing.get_context("spawn")
     with ExitStack() as stack:
-        log = stack.enter_context(given.log.open("a")) if given.log else None
-        pool = stack.enter_context(context.Pool(given.jobs, maxtasksperchild=50))
-        for told in pool.imap_unordered(_one, tasks):
-            counts[told.outcome] += 1
-            unjudged.update(text.split(":")[0] for text in told.unjudged)
-            judged += told.judged
-            if told.outcome in ("false alarm", "wrong pass", "check raised", "not built"):
-                print(f"{told.seed}: {told.outcome} {told.words}", *told.rows, sep="\n    ")
+        log = stack.enter_context(options.log.open("a")) if options.log else None
+        pool = stack.enter_context(context.Pool(options.jobs, maxtasksperchild=50))
+        for result in pool.imap_unordered(_one, tasks):
+            counts[result.outcome] += 1
+            unjudged.update(text.split(":")[0] for text in result.unjudged)
+            judged += result.judged
+            if result.outcome in ("false alarm", "wrong pass", "check raised", "not built"):
+                print(f"{result.seed}: {result.outcome} {result.words}", *result.rows, sep="\n    ")
             if log:
-                print(json.dumps(asdict(told)), file=log, flush=True)
+                print(json.dumps(asdict(result)), file=log, flush=True)
     print(", ".join(f"{n} {what}" for what, n in counts.most_common()))
     print(f"of {judged} rows about orders, h and balances not judged: {unjudged.total()}")
     print(", ".join(f"{n} {row}" for row, n in unjudged.most_common()))

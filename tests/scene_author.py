@@ -1,7 +1,7 @@
-"""Random valid scenes, each the same for the same number.
+"""Random valid scenes, determined by their number.
 
 A scene has one to four coordinates, energies or bodies, definitions, `dot`, time, inputs with
-signals, friction, names that C and Python nearly refuse, and any of the steppers that it can use.
+signals, friction, names that C and Python nearly refuse, and any applicable methods.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from eomc.base import names
 
-# single letters of C's and SymPy's, near misses of keywords, what the generated code itself says
+# Single letters of C and SymPy, names similar to keywords, names in the generated code.
 AWKWARD = """I E S N O Q C D J K L P R T U V beta gamma zeta Lambda lam lambda1 lambda_1 e i j k l
 m n o p q r s u v w x y z a b c d f g h If Or And Not Mod Max Min Abs Pow Add Symbol Integer pi2 oo
 zoo nan1 inf np math self out params index values y0_1 Int Double float1 double_1 int_1 for_1 in1
@@ -27,7 +27,7 @@ STEPPERS = (*EXPLICIT, "verlet", *IMPLICIT)
 
 @dataclass
 class _Tables:
-    """A scene as it grows: the lines of each table."""
+    """A growing scene: the lines of each table."""
 
     coordinates: list[str] = field(default_factory=list)
     parameters: list[str] = field(default_factory=list)
@@ -42,8 +42,8 @@ class _Tables:
 class Author:
     """Writes one scene.
 
-    static: D constant and forces of positions and time alone, so that every stepper can be used.
-    corners: whether something jumps or bends, so that implicit ones cannot.
+    static: D is constant and forces depend on positions and time only, so that every method is
+    applicable. corners: discontinuities or kinks, which implicit methods refuse.
     """
 
     def __init__(self, seed: int) -> None:
@@ -64,13 +64,13 @@ class Author:
         return self.names.pop()
 
     def number(self, low: float, high: float) -> str:
-        """As people write numbers: a few digits, a fraction, an integer."""
+        """Return a number as people write it: a few digits, a fraction, an integer."""
         x = self.random.uniform(low, high)
         kinds = [f"{x:.3g}", f"{x:.2g}", repr(x), f"{max(1, round(3 * x))}/3"]
         return self.random.choice(kinds) if low > 0 else f"{x:.3g}"
 
     def value(self, low: float, high: float) -> str:
-        """A parameter, mostly; a constant or the number itself."""
+        """Return a parameter in most cases, otherwise a constant or a number."""
         text, kind = self.number(low, high), self.random.random()
         if kind > 0.75:
             return f"({text})"
@@ -111,7 +111,7 @@ class Author:
             self.u.append(name)
 
     def position(self) -> str:
-        """A definition of positions, and time perhaps."""
+        """Add a definition of positions, possibly of time."""
         x, y = self.one(self.q), self.one(self.q)
         a, b = self.value(0.3, 1.5), self.number(0.2, 1)
         forms = [
@@ -174,15 +174,15 @@ class Author:
         return " + ".join(terms) if self.chance(0.93) else "0"
 
     def friction(self) -> None:
-        """Along some coordinates, by dissipation or as a force; smooth or not."""
-        lost = []
+        """Add friction along some coordinates, by dissipation or as a force; smooth or not."""
+        dissipation = []
         for x in self.q:
             if self.chance(0.5):
                 continue
             c, v = self.value(0.05, 0.8), f"{x}_dot"
             width = self.one(["0.01", "0.1", "0.5", self.value(0.02, 1)])
             if self.chance(0.5):
-                lost.append(
+                dissipation.append(
                     self.one(
                         [f"{c}*{v}**2/2", f"{c}*{v}*tanh({v}/{width})", f"{c}*{v}**4/4",
                          f"{c}*(1 + {x}**2)*{v}**2/2", f"{c}*log(cosh({v}))"]
@@ -199,8 +199,8 @@ class Author:
                 forms = [f"-{c}*sign({v})", f"-{c}*{v}*abs({v})", f"-{c}*{v}*heaviside({x})"]
                 self.corners = True
             self.force(x, self.one(forms))
-        if lost:
-            self.tables.energy.append(f'dissipation = "{" + ".join(lost)}"')
+        if dissipation:
+            self.tables.energy.append(f'dissipation = "{" + ".join(dissipation)}"')
 
     def force(self, x: str, text: str) -> None:
         self.tables.forces.setdefault(x, []).append(text)
@@ -252,10 +252,10 @@ class Author:
         return self.text([])
 
     def bodies(self) -> str:
-        """A chain or tree of bodies on joints, plane or in space."""
+        """Return a chain or tree of bodies on joints, planar or spatial."""
         plane, count, out = self.chance(0.6), self.random.choice([1, 2, 2, 3]), []
         self.static = False
-        held: list[str] = []
+        occupied: list[str] = []
         for k in range(count):
             x, lines = self.coordinate(), []
             turning = self.chance(0.7)
@@ -276,8 +276,8 @@ class Author:
             )
             lines += self.drag(x)
             out += ["[[body]]", *lines]
-            held.append(x)
-        for x in held:
+            occupied.append(x)
+        for x in occupied:
             if self.chance(0.4):
                 out += ["[[spring]]", f'coordinate = "{x}"', f'stiffness = "{self.value(1, 60)}"']
         self.inputs()
@@ -314,6 +314,6 @@ class Author:
 
 
 def scene_text(seed: int) -> str:
-    """The scene of that number as TOML: valid, always the same."""
+    """Return the scene of that number as TOML: valid and reproducible."""
     author = Author(seed)
     return author.bodies() if author.chance(0.25) else author.energies()

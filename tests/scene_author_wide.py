@@ -1,6 +1,6 @@
-"""Random valid scenes with what `scene_author` leaves out, each the same for the same number.
+"""Random valid scenes with features that `scene_author` omits, determined by their number.
 
-Outputs, limits of inputs, steps by a tolerance, events, points, forces at bodies, frames, inverse
+Outputs, limits of inputs, adaptive steps, events, points, forces at bodies, frames, inverse
 dynamics, momentum, derivatives of steps, constraints and closed loops: each in some of the scenes.
 """
 
@@ -18,7 +18,7 @@ WISHES = {"linearize": 0.3, "inverse_dynamics": 0.25, "discretize": 0.15}
 
 
 class _Wide(Author):
-    """Writes one scene. rows: names of constraints; more: arrays of tables behind all others."""
+    """Writes one scene. rows: names of constraints; more: arrays of tables at the end."""
 
     def __init__(self, seed: int) -> None:
         super().__init__(seed)
@@ -27,13 +27,13 @@ class _Wide(Author):
         self.outputs: list[str] = []
         self.arrays: list[str] = []
         self.frames: list[str] = []
-        self.held = False  # whether what a jump changes would have to obey rows
+        self.held = False  # jumps would have to satisfy the constraints
         self.jumped = random.Random(f"jumped parameters {seed}")
 
-    # --- what is added to a scene of either kind
+    # --- additions to scenes of both kinds -----
 
     def limits(self) -> None:
-        """Of some inputs."""
+        """Add limits of some inputs."""
         lines = self.tables.inputs
         for k, line in enumerate(lines):
             if not self.static and self.chance(0.3):
@@ -43,11 +43,11 @@ class _Wide(Author):
                 self.corners = True
 
     def free_name(self) -> str:
-        """No column of every run's."""
+        """Return a name that is not a column of every run."""
         return next(n for n in iter(self.name, "") if n not in ("energy", "power"))
 
-    def asked(self) -> None:
-        """Outputs."""
+    def add_outputs(self) -> None:
+        """Add outputs."""
         for _ in range(self.random.choice([0, 1, 2, 3])):
             x, y = self.one(self.q), self.one(self.q)
             forms = [
@@ -66,7 +66,7 @@ class _Wide(Author):
             self.outputs.append(f"{name} = {unit}")
 
     def adaptive(self) -> None:
-        """A tolerance, and what happens on the way."""
+        """Add a tolerance and events."""
         if self.chance(0.6):
             run = self.tables.run
             single = any('"float"' in line for line in run)
@@ -91,7 +91,7 @@ class _Wide(Author):
             self.arrays += lines
 
     def jump_of_parameter(self, x: str) -> list[str]:
-        """The line that sets one, where neither rows nor limits use it."""
+        """Return the line that sets a parameter that neither constraints nor limits use."""
         text = "\n".join([*self.rows, *(u for u in self.tables.inputs if "limits" in u)])
         named = (line.split(" = ")[0] for line in self.tables.parameters)
         free = [p for p in named if not re.search(rf"\b{p}\b", text)]
@@ -101,8 +101,8 @@ class _Wide(Author):
         to = [f"1.1*{p}", f"{p}*(1 + sin({x})**2/10)", f"{p} + 0.05*{x}_dot**2", "0.7"]
         return [f'{p} = "{self.jumped.choice(to)}"']
 
-    def wishes(self) -> None:
-        """Functions besides."""
+    def optional_functions(self) -> None:
+        """Request optional functions."""
         run = self.tables.run
         for name, part in WISHES.items():
             if name == "inverse_dynamics" or not self.corners:
@@ -117,7 +117,7 @@ class _Wide(Author):
                 run.append("momentum = true")
 
     def constrained(self) -> None:
-        """A new coordinate for each row, which the row ties to others; so they never contradict."""
+        """Add a new coordinate for each constraint, so that constraints never contradict."""
         others = list(self.q)
         for _ in range(self.random.choice([1, 1, 2])):
             x, y = self.one(others), self.one(others)
@@ -143,12 +143,12 @@ class _Wide(Author):
         self.tables.energy.append(f'kinetic = "{self.kinetic()}"')
         self.tables.energy.append(f'potential = "{self.potential()}"')
         if self.chance(0.35):
-            self.static = False  # accelerations depend on velocities then
+            self.static = False  # accelerations then depend on velocities
             self.constrained()
         return self.ended([])
 
     def bodies(self) -> str:
-        """A chain of bodies with points and forces, closed by a loop perhaps."""
+        """Return a chain of bodies with points and forces, possibly closed by a loop."""
         plane, count = self.chance(0.6), self.random.choice([1, 2, 3, 3])
         self.static = False
         close = self.chance(0.4) and count > (2 if plane else 1)
@@ -189,7 +189,7 @@ class _Wide(Author):
         return self.ended(out, f"gravity = [0, {gravity if plane else f'0, {gravity}'}]")
 
     def body(self, k: int, plane: bool, close: bool) -> list[str]:
-        # where a loop closes, all starts may move
+        # if a loop is closed, all initial values may change
         x = self.name()
         start = self.number(0.2, 1.1)
         guess = ", guess = true" if close else ""
@@ -208,7 +208,7 @@ class _Wide(Author):
         return lines + ([f'damping = "{self.value(0.05, 1)}"'] if self.chance(0.3) else [])
 
     def loop(self, last: str, plane: bool) -> list[str]:
-        """One that can close from nearly everywhere."""
+        """Return a loop that can be closed from nearly all initial values."""
         lines = ["[[loop]]", 'name = "closed"']
         if len(self.q) > 1 and self.chance(0.3):
             x, y = self.random.sample(self.q, 2)
@@ -221,13 +221,13 @@ class _Wide(Author):
         return [*lines, 'joint = "distance"', f"points = [{tip}, {ground}]", f"length = {far}"]
 
     def ended(self, more: Sequence[str], above: str = "") -> str:
-        """All that any scene may have."""
+        """Append the options of all scenes."""
         if self.random.random() < 0.5 and not self.static:
             self.friction()
         self.limits()
         self.drive()
         self.settings()
-        self.asked()
+        self.add_outputs()
         self.adaptive()
         self.wishes()
         rows = ["[constraints]", *self.rows] if self.rows else []
@@ -236,6 +236,6 @@ class _Wide(Author):
 
 
 def wide_text(seed: int) -> str:
-    """The scene of that number as TOML: valid, always the same."""
+    """Return the scene of that number as TOML: valid and reproducible."""
     author = _Wide(seed)
     return author.bodies() if author.chance(0.5) else author.energies()

@@ -1,4 +1,4 @@
-"""benchmarks/sincos.py as tests use it."""
+"""benchmarks/sincos.py, as used by tests."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LARGEST_ERROR = 1.6  # ulp
 
 
 def _benchmark() -> ModuleType:
-    """benchmarks/sincos.py, where the derivation and the harness are."""
+    """Load benchmarks/sincos.py, which contains the derivation and the harness."""
     path = ROOT / "benchmarks" / "sincos.py"
     spec = importlib.util.spec_from_file_location("benchmark_sincos", path)
     assert spec is not None and spec.loader is not None
@@ -28,22 +28,22 @@ def _benchmark() -> ModuleType:
 bench = _benchmark()
 
 
-def nearest_multiples(count: int, of: Any) -> list[int]:
-    """The n for which a number lies closest to n pi/2, measured in pi/2, from all up to the limit.
+def nearest_multiples(count: int, precision: Any) -> list[int]:
+    """Return the n, up to the limit, for which a number is closest to n pi/2, in units of pi/2.
 
-    A number 2^e m is close to n pi/2 when m/n is close to 2^-e pi/2: a convergent of its
-    continued fraction.  Multiples k (m, n) of a convergent are the runners-up.
+    A number 2^e m is close to n pi/2 if m/n is close to 2^-e pi/2: a convergent of its continued
+    fraction. Multiples k (m, n) of a convergent are the next closest.
     """
     candidates: dict[int, mpmath.mpf] = {}
     with mpmath.workprec(400):
-        for exponent in range(-of.bits, math.frexp(of.limit)[1] - of.bits + 1):
+        for exponent in range(-precision.bits, math.frexp(precision.limit)[1] - precision.bits + 1):
             ratio = mpmath.ldexp(mpmath.pi / 2, -exponent)
             whole = int(mpmath.floor(ratio))
             rest = ratio - whole
             before, n = 0, 1
-            while n <= of.last_multiple:
+            while n <= precision.last_multiple:
                 multiple = n * mpmath.pi / 2
-                if 1 <= mpmath.ldexp(multiple, 1 - of.bits - exponent) < 2:
+                if 1 <= mpmath.ldexp(multiple, 1 - precision.bits - exponent) < 2:
                     m = mpmath.nint(n * ratio)
                     candidates[n] = abs(mpmath.ldexp(m, exponent) - multiple)
                 rest = 1 / rest

@@ -1,4 +1,4 @@
-"""A module made of the reference, in the place of a compiled one, and ways to break it."""
+"""A substitute for a compiled module, made of the reference, and ways to break it."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from eomc.verify.symbolic import SymbolicReference
 from eomc.verify.trig_simplify import simplify_trig
 
 
-def simplified(reference: SymbolicReference) -> SymbolicReference:
-    """The same in shorter forms, which round differently."""
+def simplify_reference(reference: SymbolicReference) -> SymbolicReference:
+    """Return the reference in simplified forms, which round differently."""
 
     def short(e: Expr) -> Expr:
         return simplify_trig(e, reference.system.qd)
 
     names = ("D", "C", "g", "bias", "tau", "friction")
-    made = {name: getattr(reference, name).applyfunc(short) for name in names}
+    expressions = {name: getattr(reference, name).applyfunc(short) for name in names}
     K, P = short(reference.kinetic), short(reference.potential)
-    made |= {"kinetic": K, "potential": P, "energy": K + P}
-    made |= {name: short(getattr(reference, name)) for name in ("jacobi", "power")}
-    return replace(reference, **made)
+    expressions |= {"kinetic": K, "potential": P, "energy": K + P}
+    expressions |= {name: short(getattr(reference, name)) for name in ("jacobi", "power")}
+    return replace(reference, **expressions)
 
 
 class StandIn:
-    """The face of a compiled module, made of the reference alone."""
+    """The interface of a compiled module, implemented by the reference alone."""
 
     weights = np.array([1, 2, 2, 1]) / 6
 
@@ -105,8 +105,8 @@ class StandIn:
         return SimpleNamespace(t=t, q=q, qd=qd, energy=energy, status="ok")
 
 
-def bent(method: str, by: Callable[[Any], Any]) -> Callable[[StandIn], None]:
-    """A breakage: the method's value goes through `by`."""
+def modify(method: str, by: Callable[[Any], Any]) -> Callable[[StandIn], None]:
+    """Return a breakage that applies `by` to the method's result."""
 
     def bend(module: StandIn) -> None:
         right = getattr(module, method)
@@ -115,8 +115,8 @@ def bent(method: str, by: Callable[[Any], Any]) -> Callable[[StandIn], None]:
     return bend
 
 
-def flipped(*index: int) -> Callable[[np.ndarray], np.ndarray]:
-    """The same array with the sign of one entry wrong."""
+def negate(*index: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function that flips the sign of one entry of an array."""
 
     def flip(right: np.ndarray) -> np.ndarray:
         wrong = np.array(right)
@@ -126,8 +126,8 @@ def flipped(*index: int) -> Callable[[np.ndarray], np.ndarray]:
     return flip
 
 
-def deaf(method: str, to: str) -> Callable[[StandIn], None]:
-    """A breakage: the method does not hear one of its arguments."""
+def ignore(method: str, to: str) -> Callable[[StandIn], None]:
+    """Return a breakage: the method ignores one of its arguments."""
 
     def bend(module: StandIn) -> None:
         right = getattr(module, method)
@@ -140,7 +140,7 @@ def set_(name: str, value: Any) -> Callable[[StandIn], None]:
     return lambda module: setattr(module, name, value)
 
 
-def late(module: StandIn) -> None:
-    """A breakage: steps are taken as if it were earlier."""
+def delay_time(module: StandIn) -> None:
+    """Break the module: steps use an earlier time."""
     right = module.step
     module.step = lambda *x, t=0.0, **how: right(*x, t=t / 2, **how)  # type: ignore[method-assign]

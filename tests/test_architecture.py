@@ -13,7 +13,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "generator" / "eomc"
 
-# from the lowest layer to the highest; packages of one layer do not import each other
+# From the lowest layer to the highest; packages of one layer do not import each other.
 LAYERS = (
     ("base", "integrators", "runtime"),
     ("scene",),

@@ -1,4 +1,4 @@
-"""The benchmarks that change the generator change what is there."""
+"""The benchmarks that patch the generator patch names that exist."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What counts as a mutant of C, a template, Python; a sample of the generator's is noticed."""
+"""Mutants of C, templates and Python; a sample of mutants of the generator is detected."""
 
 from __future__ import annotations
 
@@ -49,27 +49,27 @@ def f(a: tuple[int, 3], b: float = 0.5) -> "int | 2":
 '''
 
 
-def found(source: str, mutants: list[Mutant]) -> set[tuple[str, str]]:
+def replacements(source: str, mutants: list[Mutant]) -> set[tuple[str, str]]:
     return {(source[m.at : m.end].strip(), m.new.strip()) for m in mutants}
 
 
-def test_of_c_the_code_alone() -> None:
-    assert found(C, of_c(C)) == {
+def test_mutants_of_c_change_code_only() -> None:
+    assert replacements(C, of_c(C)) == {
         ("<=", ">"), ("<=", "<"), ("0.5", "0.75"), ("*", "+"), ("*", "/"),
         ("-", "+"), ("1", "0"),
     }  # fmt: skip
-    assert Mutant(0, 2, "x").of("abc") == "xc"
+    assert Mutant(0, 2, "x").apply("abc") == "xc"
 
 
-def test_of_templates_what_they_write_and_their_conditions() -> None:
-    assert found(TEMPLATE, of_template(TEMPLATE)) == {
+def test_mutants_of_templates_change_output_and_conditions() -> None:
+    assert replacements(TEMPLATE, of_template(TEMPLATE)) == {
         ("one and two", "not (one and two)"), ("and", "or"), ("+=", "-="), ("+=", "="),
         ("*", "+"), ("*", "/"), ("q[{{ i + 1 }}] += h*v;", ""),
     }  # fmt: skip
 
 
-def test_of_python_what_is_computed() -> None:
-    assert found(PYTHON, of_python(PYTHON)) == {
+def test_mutants_of_python_change_computations() -> None:
+    assert replacements(PYTHON, of_python(PYTHON)) == {
         ("0.5", "0.75"), ("a", "list(a)[1:]"), ("a", "list(a)[:-1]"),
         ("x is None and not b", "not (x is None and not b)"), ("is", "is not"), ("and", "or"),
         ("not b", "(b)"), ('raise ValueError("3")', "pass"), ("b += 1", "pass"), ("+", "-"),
@@ -79,26 +79,26 @@ def test_of_python_what_is_computed() -> None:
     }  # fmt: skip
 
 
-def test_every_mutant_of_the_generator_is_python() -> None:
+def test_every_mutant_of_the_generator_can_be_parsed() -> None:
     for name in ("derive/tape.py", "runtime/integrator.py"):
         source = (ROOT / "generator" / "eomc" / name).read_text(encoding="utf-8")
         mutants = of_python(source)
         assert len(mutants) > 100
         for mutant in mutants[::10]:
-            ast.parse(mutant.of(source))
+            ast.parse(mutant.apply(source))
 
 
 @pytest.mark.slow
-def test_a_sample_is_noticed(tmp_path: Path) -> None:
-    """A third at least by four scenes alone; the whole tool asks forty, and the tests."""
+def test_sample_of_mutants_is_detected(tmp_path: Path) -> None:
+    """Four scenes detect at least a third; the whole tool uses forty scenes, and the tests."""
     pytest.importorskip("coverage")
     tool = ROOT / "tests" / "generator_mutants.py"
     only = ["derive/ldl", "c/portable/rk4", "optimised/rk4", "lanes/rotate.h"]
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, tool, "--brief", "--count", "6", "--seed", "4", "--only", *only],
         env=os.environ | {"EOMC_MUTANTS": str(tmp_path)}, capture_output=True, text=True,
     )  # fmt: skip
-    told = re.search(r"^(\d+) of (\d+) caught", done.stdout, re.M)
-    assert told, done.stdout + done.stderr
-    caught, tried = map(int, told.groups())
-    assert tried >= 5 and caught >= tried / 3, done.stdout
+    match = re.search(r"^(\d+) of (\d+) caught", process.stdout, re.M)
+    assert match, process.stdout + process.stderr
+    caught, tried = map(int, match.groups())
+    assert tried >= 5 and caught >= tried / 3, process.stdout

@@ -1,4 +1,4 @@
-"""docs/embedding.md as it is written: each section's files and commands, in an empty folder."""
+"""docs/embedding.md: files and commands of each section are run in an empty folder."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.slow
 PAGE = (ROOT / "docs" / "embedding.md").read_text(encoding="utf-8")
 EXAMPLES = ROOT / "docs" / "examples"
 SECTIONS = dict(re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", PAGE, re.MULTILINE | re.DOTALL))
-# a file, commands, or what they print
+# a file, commands, or their output
 BLOCK = re.compile(r"(?:^`([\w./]+)`:\n\n)?^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 TOOLS = {
     "In a C program": ["cc"],
@@ -28,23 +28,23 @@ TOOLS = {
 }
 
 
-def played(section: str, folder: Path) -> str:
-    """What the section's commands print; each is compared with what the page says."""
-    said = whole = ""
+def run_section(section: str, folder: Path) -> str:
+    """Run the section's commands, and compare with the printed output; return all output."""
+    output = whole = ""
     here = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     for file, language, text in BLOCK.findall(SECTIONS[section]):
         if file:
             (folder / file).write_text(text, encoding="utf-8")
         elif language == "sh":
-            done = subprocess.run(
+            process = subprocess.run(
                 ["sh", "-e", "-c", text], cwd=folder, capture_output=True, text=True,
                 env={**os.environ, "PATH": here}, stdin=subprocess.DEVNULL, timeout=500,
             )  # fmt: skip
-            assert done.returncode == 0, done.stdout + done.stderr
-            said = done.stdout
-            whole += said
+            assert process.returncode == 0, process.stdout + process.stderr
+            output = process.stdout
+            whole += output
         elif language == "text":
-            assert said.replace("\r", "").endswith(text), said
+            assert output.replace("\r", "").endswith(text), output
     return whole
 
 
@@ -53,7 +53,7 @@ def test_every_section_is_run() -> None:
 
 
 @pytest.mark.parametrize("section", TOOLS)
-def test_a_section_as_it_is_written(section: str, tmp_path: Path) -> None:
+def test_section_works_as_documented(section: str, tmp_path: Path) -> None:
     for tool in TOOLS[section]:
         needs(tool)
     if section == "On a small core":
@@ -62,9 +62,9 @@ def test_a_section_as_it_is_written(section: str, tmp_path: Path) -> None:
         pytest.importorskip("scipy")
         for file in (*(EXAMPLES / "control_loop").iterdir(), EXAMPLES / "balance.toml"):
             shutil.copy(file, tmp_path)
-    said = played(section, tmp_path)
+    output = run_section(section, tmp_path)
     if section == "A control loop":
-        found = re.search(r"angle within (\S+) rad, its rate known to (\S+) rad/s", said)
-        assert found and float(found[1]) < 2e-3 and float(found[2]) < 2e-3, said
-        usual, _, worst = map(float, re.findall(r"(\S+) us", said))
+        match = re.search(r"angle within (\S+) rad, its rate known to (\S+) rad/s", output)
+        assert match and float(match[1]) < 2e-3 and float(match[2]) < 2e-3, output
+        usual, _, worst = map(float, re.findall(r"(\S+) us", output))
         assert 0 < usual < 1000 and usual <= worst, "within a period of 1 ms"

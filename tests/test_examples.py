@@ -1,4 +1,4 @@
-"""The scripts of docs/examples run as they are written, and do what they say."""
+"""The scripts of docs/examples run as documented."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from conftest import ROOT
 
 pytestmark = pytest.mark.usefixtures("unoptimised_file")
 EXAMPLES = ROOT / "docs" / "examples"
-FOLDER = ROOT / "build" / "tests" / "examples"  # where their scene is built, once
+FOLDER = ROOT / "build" / "tests" / "examples"  # their scenes are built there once
 needs_gymnasium = pytest.mark.skipif(
     importlib.util.find_spec("gymnasium") is None, reason="gymnasium is not installed"
 )
@@ -26,28 +26,28 @@ needs_scipy = pytest.mark.skipif(
 
 
 @cache
-def said(name: str) -> str:
-    """What a script prints; it ends well and has nothing to complain of."""
+def run_script(name: str) -> str:
+    """Run a script without errors or warnings; return its output."""
     FOLDER.mkdir(parents=True, exist_ok=True)
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-W", "error", str(EXAMPLES / name)], cwd=FOLDER, capture_output=True,
         text=True,
     )  # fmt: skip
-    assert (done.returncode, done.stderr) == (0, ""), done.stderr
-    return done.stdout
+    assert (process.returncode, process.stderr) == (0, ""), process.stderr
+    return process.stdout
 
 
 def numbers(text: str, pattern: str) -> list[float]:
-    """The groups of the pattern as numbers, one match after the other."""
-    found = re.findall(pattern, text)
-    assert found, text
-    return [float(x) for match in found for x in ([match] if isinstance(match, str) else match)]
+    """Return the groups of the pattern as numbers, for all matches in order."""
+    matches = re.findall(pattern, text)
+    assert matches, text
+    return [float(x) for match in matches for x in ([match] if isinstance(match, str) else match)]
 
 
 @needs_scipy
 @pytest.mark.slow
-def test_the_pole_is_balanced_within_the_limits() -> None:
-    text = said("lqr.py")
+def test_pole_is_balanced_within_the_limits() -> None:
+    text = run_script("lqr.py")
     low, high = numbers(text, r"force between (\S+) and (\S+) N")
     assert low == -10 and high <= 10
     beyond, rows = numbers(text, r"at (\d+) of (\d+) rows")
@@ -60,8 +60,8 @@ def test_the_pole_is_balanced_within_the_limits() -> None:
 
 @pytest.mark.slow
 @needs_scipy
-def test_the_quadrotor_comes_to_hover() -> None:
-    text = said("quadrotor.py")
+def test_quadrotor_reaches_hover() -> None:
+    text = run_script("quadrotor.py")
     assert text.startswith("12 states")
     end = np.array(numbers(text.partition("[")[2].partition("]")[0], r"(\S+)"))
     assert np.allclose(end, [0, 0, 1, 1, 0, 0, 0], atol=1e-3)
@@ -70,8 +70,8 @@ def test_the_quadrotor_comes_to_hover() -> None:
 
 @pytest.mark.slow
 @needs_scipy
-def test_the_pole_is_swung_up() -> None:
-    text = said("swing_up.py")
+def test_pole_is_swung_up() -> None:
+    text = run_script("swing_up.py")
     assert numbers(text, r"upright from t = (\S+) s")[0] < 10
     x, y = numbers(text, r"tip is at (\S+) m, (\S+) m")
     assert abs(x) < 1e-3 and y == pytest.approx(1, abs=1e-3)
@@ -79,29 +79,29 @@ def test_the_pole_is_swung_up() -> None:
 
 
 @pytest.mark.slow
-def test_a_heavier_pole_is_caught_less_far() -> None:
-    lines = np.reshape(numbers(said("sweep.py"), r"(\S+) kg: up to (\S+) rad"), (-1, 2))
+def test_region_of_attraction_shrinks_for_a_heavier_pole() -> None:
+    lines = np.reshape(numbers(run_script("sweep.py"), r"(\S+) kg: up to (\S+) rad"), (-1, 2))
     assert lines[:, 0].tolist() == pytest.approx(np.linspace(0.1, 0.8, 8))
     assert np.all(np.diff(lines[:, 1]) < 0) and 0.2 < lines[-1, 1] < lines[0, 1] < 1
 
 
 @needs_gymnasium
 @pytest.mark.slow
-def test_many_poles_are_kept_up() -> None:
-    text = said("vector_env.py")
+def test_feedback_balances_many_poles() -> None:
+    text = run_script("vector_env.py")
     assert text.startswith("observed: cart tip_x tip_y speed turn swing")
     by_chance, by_feedback = numbers(text, r"forces: (\S+) falls[^:]*feedback: (\S+) falls")
     assert by_chance > 3 and by_feedback < 0.1
 
 
 @needs_gymnasium
-def test_the_environment_is_what_gymnasium_expects(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_environment_satisfies_gymnasium(monkeypatch: pytest.MonkeyPatch) -> None:
     from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
     FOLDER.mkdir(parents=True, exist_ok=True)
     monkeypatch.chdir(FOLDER)
-    made = runpy.run_path(str(EXAMPLES / "vector_env.py"))
-    poles = made["CartPoles"](8)
+    namespace = runpy.run_path(str(EXAMPLES / "vector_env.py"))
+    poles = namespace["CartPoles"](8)
     env = RecordEpisodeStatistics(poles)
     first, _ = env.reset(seed=3)
     assert poles.observation_space.contains(first)
@@ -109,19 +109,19 @@ def test_the_environment_is_what_gymnasium_expects(monkeypatch: pytest.MonkeyPat
     push = np.full((8, 1), 10.0)
     assert poles.action_space.contains(push)
     for _ in range(60):
-        seen, rewards, over, late, info = env.step(push)
-        assert poles.observation_space.contains(seen) and rewards.shape == over.shape == (8,)
+        observation, rewards, over, late, info = env.step(push)
+        assert poles.observation_space.contains(observation) and rewards.shape == over.shape == (8,)
         if over.any():
             break
     assert over.any() and not late.any()
     lean = np.arccos(info["final_obs"][:, 2])
-    assert np.array_equal(lean > 0.5, over) and np.all(np.arccos(seen[over, 2]) < 0.1)
+    assert np.array_equal(lean > 0.5, over) and np.all(np.arccos(observation[over, 2]) < 0.1)
     assert info["episode"]["l"][over].min() > 5
 
 
 @pytest.mark.slow
-def test_the_path_of_the_tip_is_in_the_file() -> None:
-    text = said("tip_path.py")
+def test_path_of_the_tip_is_in_the_file() -> None:
+    text = run_script("tip_path.py")
     table = np.genfromtxt(FOLDER / "path.csv", delimiter=",", names=True)
     (x, y, fastest), (change,) = (
         numbers(text, r"x = (\S+) m, y = (\S+) m; fastest (\S+)"),
@@ -140,8 +140,8 @@ def test_the_path_of_the_tip_is_in_the_file() -> None:
     reason="FMPy and PythonFMU3 are not installed: pip install '.[fmu]'",
 )
 @pytest.mark.slow
-def test_a_controller_that_is_another_unit_holds_the_arm() -> None:
-    text = said("fmu_pid.py")
+def test_controller_in_another_fmu_balances_the_arm() -> None:
+    text = run_script("fmu_pid.py")
     angle, highest = numbers(text, r"at (\S+) rad, at most (\S+);")
     assert angle == pytest.approx(1.2, abs=1e-3) and 1.2 < highest < 1.5
     motor, weight = numbers(text, r"holds (\S+) N m, the weight pulls (\S+) N m")
@@ -151,7 +151,7 @@ def test_a_controller_that_is_another_unit_holds_the_arm() -> None:
 
 
 @pytest.mark.slow
-def test_an_arm_is_held_and_pushed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_arm_is_controlled_against_a_push(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("mujoco", reason="robot files come with pip install '.[robots]'")
     from robots.test_robots_mujoco import robot_data
 
@@ -164,28 +164,28 @@ def test_an_arm_is_held_and_pushed(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     )[0]
     eomc = f"{sys.executable} -m {first}"
     for command in (eomc, second, f"{sys.executable} -W error {script} ur5.toml"):
-        done = subprocess.run(command, shell=True, capture_output=True, text=True)
-        assert done.returncode == 0, done.stderr
-    assert numbers(done.stdout, r"then: (\S+) rad")[0] < 1e-10
-    assert numbers(done.stdout, r"f to (\S+) N m")[0] < 1e-12
-    assert "[ 0.   0.   0.1  0.   0.   0. ]" in done.stdout.replace("-0. ", " 0. ")
+        process = subprocess.run(command, shell=True, capture_output=True, text=True)
+        assert process.returncode == 0, process.stderr
+    assert numbers(process.stdout, r"then: (\S+) rad")[0] < 1e-10
+    assert numbers(process.stdout, r"f to (\S+) N m")[0] < 1e-12
+    assert "[ 0.   0.   0.1  0.   0.   0. ]" in process.stdout.replace("-0. ", " 0. ")
 
 
-def test_without_its_scene_one_says_how_it_is_run() -> None:
+def test_script_without_its_scene_prints_its_usage() -> None:
     words = [sys.executable, EXAMPLES / "arm.py"]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert done.returncode == 1 and "python docs/examples/arm.py ur5.toml\n" in done.stderr
-    assert "Traceback" not in done.stderr
+    process = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert process.returncode == 1 and "python docs/examples/arm.py ur5.toml\n" in process.stderr
+    assert "Traceback" not in process.stderr
 
 
-def test_the_documents_name_each() -> None:
+def test_documentation_names_every_example() -> None:
     text = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
     for file in sorted(EXAMPLES.iterdir()):
         assert f"](examples/{file.name})" in text, file.name
 
 
-def test_they_stand_on_their_own() -> None:
-    """Each says how to run it; the scene lies beside them."""
+def test_examples_are_self_contained() -> None:
+    """Each example says how to run it and has its scene in the same folder."""
     for file in sorted(EXAMPLES.glob("*.py")):
         how = "pythonfmu3 build -f" if file.name.endswith("_unit.py") else "python"
         assert f"{how} docs/examples/{file.name}" in file.read_text(encoding="utf-8")

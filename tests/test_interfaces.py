@@ -1,4 +1,4 @@
-"""docs/interfaces.md is followed as it is written, as far as the tools are here."""
+"""docs/interfaces.md is followed as written, if the tools are installed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fmus import plain
 from eomc.cli.main import main
 
 TEXT = (ROOT / "docs" / "interfaces.md").read_text(encoding="utf-8")
-SAID = r"x = (\S+) m, theta = (\S+) rad"
+FINAL_STATE = r"x = (\S+) m, theta = (\S+) rad"
 STRICT = "-std=c99 -Wall -Wextra -Werror -Ic -I.".split()
 
 
@@ -24,23 +24,23 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", TEXT, re.S)
 
 
-def ran(*command: str, at: Path) -> str:
-    done = subprocess.run(command, cwd=at, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
+def run_command(*command: str, at: Path) -> str:
+    process = subprocess.run(command, cwd=at, capture_output=True, text=True)
+    assert process.returncode == 0, process.stdout + process.stderr
+    return process.stdout
 
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder in which the page's commands have been typed."""
+    """The folder in which the page's commands have been run."""
     here = tmp_path_factory.mktemp("interfaces")
     (commands,) = blocks("sh")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(here)
         for command in commands.splitlines():
             name, *words = command.split()
-            done = CliRunner().invoke(main, words)
-            assert (name, done.exit_code) == ("eomc", 0), done.output
+            result = CliRunner().invoke(main, words)
+            assert (name, result.exit_code) == ("eomc", 0), result.output
     return here
 
 
@@ -50,14 +50,14 @@ def end() -> tuple[float, float]:
 
 
 def ends_there(text: str) -> bool:
-    found = re.search(SAID, text)
-    return found is not None and [float(x) for x in found.groups()] == pytest.approx(
+    match = re.search(FINAL_STATE, text)
+    return match is not None and [float(x) for x in match.groups()] == pytest.approx(
         end(), rel=1e-10
     )
 
 
 @pytest.mark.slow
-def test_the_page_says_what_is_so() -> None:
+def test_numbers_of_the_page_are_correct() -> None:
     assert ends_there(TEXT)
 
 
@@ -73,31 +73,31 @@ def test_rust(page: Path) -> None:
     (crate / "Cargo.toml").write_text(
         '[package]\nname = "pole"\nversion = "0.1.0"\nedition = "2021"\n', encoding="utf-8"
     )
-    assert ends_there(ran(cargo, "run", "--offline", "--quiet", at=crate))
+    assert ends_there(run_command(cargo, "run", "--offline", "--quiet", at=crate))
 
 
 def test_julia(page: Path) -> None:
     julia = needs("julia")
     (program,) = blocks("julia")
     (page / "pole.jl").write_text(program, encoding="utf-8")
-    assert ends_there(ran(julia, "pole.jl", at=page))
+    assert ends_there(run_command(julia, "pole.jl", at=page))
 
 
 @pytest.mark.slow
 def test_casadi(page: Path) -> None:
     pytest.importorskip("casadi", reason="CasADi is not installed: pip install '.[fmu]'")
     (program,) = blocks("python")
-    said = ran(sys.executable, "-c", program, at=page)
-    numbers = [float(x) for x in re.findall(r"[-\d.]+(?:e[-+]\d+)?", said)]
+    output = run_command(sys.executable, "-c", program, at=page)
+    numbers = [float(x) for x in re.findall(r"[-\d.]+(?:e[-+]\d+)?", output)]
     expected = plain("cartpole").acceleration([0.0, 0.1], [0.0, 0.0])
     assert numbers[:4] == pytest.approx([0, 0, *expected], rel=1e-5)
-    # the Jacobian of [qd; qdd] along [q; qd]
+    # The Jacobian of [qd; qdd] with respect to [q; qd].
     assert numbers[4:12] == [0, 0, 1, 0, 0, 0, 0, 1]
     A, B = [plain("cartpole").acceleration([0.0, 0.1 + d], [0.0, 0.0]) for d in (1e-6, -1e-6)]
     assert [numbers[13], numbers[17]] == pytest.approx((A - B) / 2e-6, rel=1e-5)
 
 
-def test_the_c_of_simulinks_block(page: Path) -> None:
+def test_c_of_the_simulink_block(page: Path) -> None:
     (header,) = blocks("c")
     (page / "cartpole_block.h").write_text(header, encoding="utf-8")
     (specification,) = blocks("matlab")
@@ -108,7 +108,7 @@ def test_the_c_of_simulinks_block(page: Path) -> None:
         '    cartpole_block(a, q, qd, p);\n    printf("%.17g %.17g\\n", a[0], a[1]);\n}\n',
         encoding="utf-8",
     )
-    ran(needs("cc"), *STRICT, "block.c", "c/cartpole.c", "-lm", "-o", "block", at=page)
+    run_command(needs("cc"), *STRICT, "block.c", "c/cartpole.c", "-lm", "-o", "block", at=page)
     expected = plain("cartpole").acceleration([0.0, 0.1], [0.3, 0.2])
-    found = [float(x) for x in ran("./block", at=page).split()]
-    assert found == pytest.approx(list(expected), rel=1e-14)
+    acceleration = [float(x) for x in run_command("./block", at=page).split()]
+    assert acceleration == pytest.approx(list(expected), rel=1e-14)

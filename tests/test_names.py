@@ -13,7 +13,7 @@ import eomc
 PUBLIC = {"System", "build", "dot", "equations", "export_fmu", "load", "read", "sources"}
 
 
-def test_dir_lists_what_the_package_offers_and_no_more() -> None:
+def test_dir_lists_the_public_names_of_the_package() -> None:
     names = {name for name in dir(eomc) if not name.startswith("__")}
     assert names == PUBLIC | {"EomcError", "SceneError"}
     assert all(hasattr(eomc, name) for name in names)
@@ -30,7 +30,7 @@ def test_dir_of_a_module_lists_its_functions_and_no_files(driven: ModuleType) ->
 
 
 def test_notebooks_show_the_message_of_an_error_alone(driven: ModuleType) -> None:
-    """IPython asks errors for the lines in place of the traceback."""
+    """IPython calls a method of errors for the lines that replace the traceback."""
     with pytest.raises(eomc.EomcError) as fault:
         eomc.load("nowhere.toml")
     assert fault.value._render_traceback_() == [f"{fault.type.__name__}: {fault.value}"]

@@ -1,4 +1,4 @@
-"""What the README shows is what happens."""
+"""The code and output in the README are correct."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 
 
 def blocks(language: str) -> list[str]:
-    """The code blocks of a language, in their order."""
+    """Return the code blocks of a language, in order."""
     return re.findall(rf"```{language}\n(.*?)```", README, re.S)
 
 
-def test_the_scene_is_the_one_that_is_there() -> None:
+def test_scene_is_the_shipped_one() -> None:
     (shown,) = map(tomllib.loads, blocks("toml"))
     whole = tomllib.loads((SCENES / "cartpole.toml").read_text(encoding="utf-8"))
     for table in ("energy", "definitions", "run"):
@@ -31,20 +31,20 @@ def test_the_scene_is_the_one_that_is_there() -> None:
         assert coordinate.items() <= whole["coordinates"][name].items()
 
 
-def test_the_c_shown_is_generated_and_the_program_prints_what_is_said(tmp_path: Path) -> None:
+def test_c_code_is_generated_and_program_prints_the_output(tmp_path: Path) -> None:
     files = eomc.sources(eomc.read(SCENES / "cartpole.toml")).files
     function, program = blocks("c")
     assert function in files["cartpole.c"]
     for name in ("cartpole.h", "cartpole.c"):
         (tmp_path / name).write_text(files[name], encoding="utf-8")
     (tmp_path / "main.c").write_text(program, encoding="utf-8")
-    command, said = next(b for b in blocks("sh") if "a.out" in b).strip().split("\n")
+    command, output = next(b for b in blocks("sh") if "a.out" in b).strip().split("\n")
     command = command.removeprefix("$ ").replace("cc ", needs("cc") + " ", 1)
-    done = subprocess.run(command, shell=True, cwd=tmp_path, capture_output=True, text=True)
-    assert done.stdout.strip() == said
+    process = subprocess.run(command, shell=True, cwd=tmp_path, capture_output=True, text=True)
+    assert process.stdout.strip() == output
 
 
-def test_python_answers_as_shown() -> None:
+def test_python_prints_the_output() -> None:
     (session,) = (b for b in blocks("python") if ">>>" in b)
     where = f"{str(SCENES / 'cartpole.toml')!r}, {str(MODULES)!r}"
     session = session.replace('"scenes/cartpole.toml"', where)
@@ -52,7 +52,7 @@ def test_python_answers_as_shown() -> None:
     assert doctest.DocTestRunner().run(test).failed == 0
 
 
-def test_nothing_tells_to_install_eomc_from_a_package_index() -> None:
+def test_no_page_installs_eomc_from_a_package_index() -> None:
     """No index has a package of that name: clones and wheels are installed by path."""
     by_name = re.compile(r"""pip3? install (?:-\S+ )*\\?["']?eomc(?![\w./*-])""")
     assert by_name.search("pip install " + '"eomc[plot]"')
@@ -66,19 +66,19 @@ def test_nothing_tells_to_install_eomc_from_a_package_index() -> None:
 
 
 def headings(page: Path) -> set[str]:
-    """The anchors of a page's headings, outside its blocks of code."""
+    """Return the anchors of a page's headings, outside code blocks."""
     text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.S)
     titles = re.findall(r"^#+ +(.+?) *$", text, re.M)
     return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
 
 
-def test_links_between_pages_lead_somewhere() -> None:
+def test_links_between_pages_have_targets() -> None:
     root = Path(__file__).parents[1]
-    lost = []
+    broken = []
     for page in sorted([*root.glob("*.md"), *root.glob("docs/**/*.md")]):
         for to in re.findall(r"\]\(([^)\s:]+)\)", page.read_text(encoding="utf-8")):
             file, _, anchor = to.partition("#")
             there = (page.parent / file).resolve() if file else page
             if not there.exists() or (anchor and anchor not in headings(there)):
-                lost.append(f"{page.name}: {to}")
-    assert not lost
+                broken.append(f"{page.name}: {to}")
+    assert not broken

@@ -1,4 +1,4 @@
-"""docs/SECURITY.md lists what is shipped and what it needs, with licences; it can't go stale."""
+"""docs/SECURITY.md lists what is shipped and its dependencies, with up-to-date licences."""
 
 from __future__ import annotations
 
@@ -21,38 +21,38 @@ SHIPPED = [f for part in ("generator/eomc", "templates", "csrc", "scenes") for f
 
 
 def licences(package: str) -> str:
-    """All that it says of its licence."""
-    said = metadata(package)
-    classified = [c for c in said.get_all("Classifier", []) if c.startswith("License")]
-    words = " ".join([said.get("License-Expression", ""), said.get("License", ""), *classified])
+    """Return the licence fields of a package's metadata."""
+    fields = metadata(package)
+    classified = [c for c in fields.get_all("Classifier", []) if c.startswith("License")]
+    words = " ".join([fields.get("License-Expression", ""), fields.get("License", ""), *classified])
     return words.replace("Python Software Foundation", "PSF")
 
 
-def test_the_table_is_what_the_project_declares() -> None:
+def test_table_lists_the_declared_dependencies() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    wanted = dict.fromkeys(project["dependencies"], "")
+    expected = dict.fromkeys(project["dependencies"], "")
     for extra, words in EXTRAS.items():
-        wanted |= dict.fromkeys(project["optional-dependencies"][extra], words)
-    assert {name + bound for name, bound, *_ in ROWS} == set(wanted)
+        expected |= dict.fromkeys(project["optional-dependencies"][extra], words)
+    assert {name + bound for name, bound, *_ in ROWS} == set(expected)
     for name, bound, _, use in ROWS:
-        assert (f"(`{wanted[name + bound]}`)" in use) == bool(wanted[name + bound])
+        assert (f"(`{expected[name + bound]}`)" in use) == bool(expected[name + bound])
 
 
-def test_licences_are_what_the_packages_say() -> None:
-    seen = 0
+def test_licences_are_those_of_the_packages() -> None:
+    count = 0
     for name, _, licence, _ in ROWS:
         try:
             words = licences(name)
         except PackageNotFoundError:
             continue
         assert licence in words, (name, words)
-        seen += 1
-    assert seen >= 8
+        count += 1
+    assert count >= 8
 
 
-def test_what_these_need_is_told() -> None:
-    """Without extras, and of what eomc needs in any case."""
-    told = {name.strip().lower() for name in PAGE.split("need (")[1].split("):")[0].split(",")}
+def test_indirect_dependencies_are_listed() -> None:
+    """Without extras, and including those that eomc itself requires."""
+    listed = {name.strip().lower() for name in PAGE.split("need (")[1].split("):")[0].split(",")}
     direct = {name for name, *_, use in ROWS if "eomc[" not in use}
     needed: set[str] = set()
     waiting = sorted(direct)
@@ -64,18 +64,18 @@ def test_what_these_need_is_told() -> None:
                 if name not in needed | direct:
                     needed.add(name)
                     waiting.append(name)
-    assert needed <= {name.replace("\n", " ").strip() for name in told}
+    assert needed <= {name.replace("\n", " ").strip() for name in listed}
 
 
-def test_nothing_else_is_imported() -> None:
-    found = set()
+def test_only_listed_packages_are_imported() -> None:
+    imported = set()
     for name in modules():
         for node in nodes(name):
             if isinstance(node, ast.Import):
-                found |= {alias.name.split(".")[0] for alias in node.names}
+                imported |= {alias.name.split(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and not node.level:
-                found.add(str(node.module).split(".")[0])
-    others = found - sys.stdlib_module_names - {"eomc"}
+                imported.add(str(node.module).split(".")[0])
+    others = imported - sys.stdlib_module_names - {"eomc"}
     own = {
         "_cffi_backend": "cffi",
         "pydantic_core": "pydantic",
@@ -86,7 +86,7 @@ def test_nothing_else_is_imported() -> None:
     assert {own.get(name, name) for name in others} == {name for name, *_ in ROWS}
 
 
-def test_the_work_of_others_is_named() -> None:
+def test_third_party_work_is_named() -> None:
     theirs = {f.relative_to(ROOT) for f in SHIPPED if b"Copyright" in f.read_bytes()}
     assert theirs == {Path(f"csrc/fmi/{name}") for name in [
         "LICENSE.txt", "fmi2FunctionTypes.h", "fmi2Functions.h", "fmi2TypesPlatform.h",
@@ -96,7 +96,7 @@ def test_the_work_of_others_is_named() -> None:
     assert {f.suffix for f in SHIPPED} <= texts  # nothing compiled, minified or packed
 
 
-def test_pages_load_nothing() -> None:
+def test_pages_load_no_external_resources() -> None:
     for page in (ROOT / "templates" / "report").glob("*.html.jinja"):
         text = page.read_text(encoding="utf-8")
         assert "default-src 'none'" in text, page

@@ -1,4 +1,4 @@
-"""Trees of bodies as the text of scenes: some by hand, and a strategy for every kind."""
+"""Trees of bodies as scene texts: some written by hand, and a Hypothesis strategy for all kinds."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def text(
     more: Sequence[tuple[str, Entry]] = (),
     start: float = 0.3,
 ) -> str:
-    """A scene; `more`: the other tables, each with its heading."""
+    """Return a scene; `more`: the other tables, each with its heading."""
     moved_by = [q for body in bodies for q in _listed(body.get("coordinates", []))]
     names = dict.fromkeys(q for q in moved_by if q.isidentifier())  # the others are formulas
     tables = [
@@ -48,11 +48,11 @@ def _toml(value: Any) -> str:
     return json.dumps(value)
 
 
-# --- by hand --------------------------------------------------------------------------------------
+# --- written by hand ------------------------------------------------------------------------------
 
 
 def chain(links: int, points: bool = False) -> str:
-    """A plane chain of equal rods, or of point masses at their ends, in relative angles."""
+    """Return a planar chain of equal rods, or of point masses at their ends, in relative angles."""
     rod = {"center": ["l", 0]} if points else {"center": ["l/2", 0], "inertia": "m*l**2/12"}
     bodies = [
         {"name": f"link{k}", "joint": "revolute", "coordinates": f"q{k}", "mass": "m", **rod,
@@ -63,7 +63,7 @@ def chain(links: int, points: bool = False) -> str:
 
 
 def arm(joints: int = 7, numbers: bool = False, straight: bool = False) -> str:
-    """An arm with perpendicular axes and a general inertia in each link, in parameters or not.
+    """Return an arm with perpendicular axes and general inertias, as parameters or numbers.
 
     straight: the links are symmetric about their own x, y and z instead.
     """
@@ -77,10 +77,10 @@ def arm(joints: int = 7, numbers: bool = False, straight: bool = False) -> str:
             size[0], *(centre * x for x in wave[1:4]), *(size[1] + x / 50 for x in wave[4:7]),
             *(x / 50 for x in wave[7:10]), 0.3 + wave[10] / 10,
         ]  # fmt: skip
-        given = {f"{n}{k}": round(v, 6) for n, v in zip(names, values, strict=True)}
-        m, cx, cy, cz, *moments, d = given.values() if numbers else given
+        values_by_name = {f"{n}{k}": round(v, 6) for n, v in zip(names, values, strict=True)}
+        m, cx, cy, cz, *moments, d = values_by_name.values() if numbers else values_by_name
         if not numbers:
-            parameters |= given
+            parameters |= values_by_name
         if straight:
             cx = cz = 0
             moments[3:] = 0, 0, 0
@@ -94,7 +94,7 @@ def arm(joints: int = 7, numbers: bool = False, straight: bool = False) -> str:
 
 
 def star(arms: int, joints: int = 3) -> str:
-    """Arms side by side on the world."""
+    """Return arms side by side on the world."""
     bodies = [
         {"name": f"b{a}_{k}", "joint": "revolute", "coordinates": f"q{a}_{k}", "mass": "m",
          "axis": [0, k % 2, 1 - k % 2], "center": [0.1, 0.2, "c"], "inertia": ["J", "J", "J"],
@@ -106,11 +106,11 @@ def star(arms: int, joints: int = 3) -> str:
     return text(bodies, [0, 0, "-g"], {"m": 1.0, "c": 0.3, "J": 0.02, "l": 0.5, "g": 9.81})
 
 
-# --- at random ------------------------------------------------------------------------------------
+# --- random trees ---------------------------------------------------------------------------------
 
 PARAMETERS = {"m": 1.3, "l": 0.6, "J": 0.05, "c": 0.2, "k": 30.0, "g": 9.81, "alpha": 0.4}
 
-# the parent of each joint's body, -1 for the world: every tree of up to three, in every order
+# Parent of each joint's body, -1 for the world: every tree of up to three joints, in every order.
 SHAPES = [(-1,), *((-1, p) for p in (-1, 0)), *((-1, p, r) for p in (-1, 0) for r in (-1, 0, 1))]
 
 PLANE = ("revolute", "prismatic")
@@ -123,18 +123,18 @@ _AXES = ([1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, 0, -1], [1, 2, -2], [0
 
 @st.composite
 def trees(draw: Any, shape: Sequence[int], plane: bool) -> str:
-    """A tree of this shape as a scene, with whatever else scenes of bodies may have."""
+    """Return a tree of this shape as a scene, with random other features of scenes of bodies."""
     bodies: list[dict[str, Any]] = []
     kinds = [draw(st.sampled_from(PLANE if plane else SPACE)) for _ in shape]
     for k, (parent, kind) in enumerate(zip(shape, kinds, strict=True)):
         bodies.append(_body(draw, f"b{k}", parent, kind, k not in shape, plane))
     coordinates = [q for body in bodies for q in body["coordinates"]]
-    if draw(st.booleans()):  # something geared to the joints
+    if draw(st.booleans()):  # a body geared to the joints
         parent = draw(st.sampled_from(["world", *(body["name"] for body in bodies)]))
         geared = _body(draw, "geared", -1, draw(st.sampled_from(PLANE)), True, plane)
         geared |= {"parent": parent, "coordinates": draw(st.sampled_from(GEARS))}
         bodies.append(geared)
-    if draw(st.booleans()):  # something screwed on
+    if draw(st.booleans()):  # a screw joint
         bodies.append(
             {"name": "load", "parent": draw(st.sampled_from(["world", "b0"])), "joint": "fixed",
              **_place(draw, plane), **_mass(draw, True, plane)}
@@ -210,7 +210,7 @@ def _vector(draw: Any, plane: bool) -> list[Any]:
 
 
 def _mass(draw: Any, leaf: bool, plane: bool) -> dict[str, Any]:
-    """Of a body in the midst of a tree: perhaps none at all, or a point's, or a rod's."""
+    """Return the mass of a body; inside a tree possibly none, or that of a point or rod."""
     full = (
         [0.07, "J"] if plane else [["J", "J", "J"], [0.02, 0.03, "J/2"],
                                    [0.05, "J", 0.04, 0.004, -0.006, "J/20"]]
@@ -224,17 +224,17 @@ def _mass(draw: Any, leaf: bool, plane: bool) -> dict[str, Any]:
 
 
 def geared(wheel: str, slide: str) -> str:
-    """A wheel and a slide that move by these formulas of an arm's coordinates."""
-    given = {"mass": "m", "center": [0.1, -0.2, "l/3"], "inertia": [0.05, "J", 0.04, 0.004, 0, 0]}
+    """Return a wheel and a slide that move by these formulas of an arm's coordinates."""
+    mass = {"mass": "m", "center": [0.1, -0.2, "l/3"], "inertia": [0.05, "J", 0.04, 0.004, 0, 0]}
     more = {"armature": 0.03, "damping": "c", "friction": "c", "friction_width": 0.5}
     bodies = [
-        {"name": "arm", "joint": "revolute", "coordinates": "a", "axis": [1, 2, -2], **given},
+        {"name": "arm", "joint": "revolute", "coordinates": "a", "axis": [1, 2, -2], **mass},
         {"name": "hand", "parent": "arm", "joint": "universal", "coordinates": ["b", "a - b"],
-         "offset": ["l", 0, 0], **given},
+         "offset": ["l", 0, 0], **mass},
         {"name": "wheel", "parent": "arm", "joint": "revolute", "coordinates": wheel,
-         "offset": [0, "l", 0], "axis": [0, 1, 0], **given, **more, "actuator": "u"},
+         "offset": [0, "l", 0], "axis": [0, 1, 0], **mass, **more, "actuator": "u"},
         {"name": "slide", "parent": "wheel", "joint": "prismatic", "coordinates": slide,
-         "axis": [3, 0, 4], **given, **more},
+         "axis": [3, 0, 4], **mass, **more},
     ]  # fmt: skip
     inputs = ("[inputs]", {"u": {"signal": "sin(t)"}})
     return text(bodies, [0, 1, "-g"], PARAMETERS, [inputs])

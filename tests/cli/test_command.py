@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import sympy
-from builds import KEPT
+from builds import REUSED_BUILDS
 from click.testing import CliRunner, Result
 
 from eomc import pipeline
@@ -43,7 +43,7 @@ def built_folder(scene_folder: Path) -> Path:
 def folder_with_module(scene_folder: Path, name: str) -> Path:
     """Return `scene_folder` with the module of a scene."""
     shutil.copytree(
-        pipeline.build(SCENES / f"{name}.toml", KEPT).folder, scene_folder / "build" / name
+        pipeline.build(SCENES / f"{name}.toml", REUSED_BUILDS).folder, scene_folder / "build" / name
     )
     return scene_folder
 

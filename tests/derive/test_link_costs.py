@@ -20,12 +20,12 @@ from links import (
     c,
     cheapest,
     cos,
-    hung,
     independent,
+    link_end,
     links,
     m,
-    made_of,
     moving,
+    read_system,
     sin,
     states,
     x,
@@ -51,16 +51,16 @@ BATCH = "\n[run]\nbatch = true\n"
 def test_flops_per_link_of_a_chain(n: int, equal: int, unequal: int) -> None:
     """19 a link; 24 with unequal masses and lengths, or with short dependency chains."""
     chain = [k - 1 for k in range(n)]
-    assert by_multipliers(made_of(links(chain) + BATCH)).cost.flops <= equal
-    assert by_multipliers(made_of(links(chain, equal=False) + BATCH)).cost.flops <= unequal
-    prompt = by_multipliers(made_of(links(chain))).cost
+    assert by_multipliers(read_system(links(chain) + BATCH)).cost.flops <= equal
+    assert by_multipliers(read_system(links(chain, equal=False) + BATCH)).cost.flops <= unequal
+    prompt = by_multipliers(read_system(links(chain))).cost
     assert prompt.flops <= 24 * n
     assert prompt.divisions <= n // 2
 
 
 def test_chain_is_eliminated_from_both_ends() -> None:
     """Then only half of its divisions depend on one another."""
-    order = link_multipliers.solution(made_of(links([k - 1 for k in range(9)]) + BATCH)).order
+    order = link_multipliers.solution(read_system(links([k - 1 for k in range(9)]) + BATCH)).order
     assert [order.index(k) for k in range(4)] == sorted(order.index(k) for k in range(4))
     assert [order.index(k) for k in (8, 7, 6, 5)] == sorted(order.index(k) for k in (5, 6, 7, 8))
     assert order[-1] == 4
@@ -69,20 +69,20 @@ def test_chain_is_eliminated_from_both_ends() -> None:
 @pytest.mark.parametrize("relative", [False, True], ids=["absolute", "relative"])
 def test_order_gives_the_last_coordinate_of_each_angle(relative: bool) -> None:
     """It is the link's own coordinate, whatever the angle is measured from."""
-    order = link_multipliers.solution(made_of(links(CHAIN, relative=relative))).order
+    order = link_multipliers.solution(read_system(links(CHAIN, relative=relative))).order
     assert sorted(order) == [0, 1, 2, 3, 4]
 
 
 def test_alternate_links_are_eliminated_first_for_one_trajectory() -> None:
     """Their pivots depend on parameters only; the other links follow from both ends."""
-    order = link_multipliers.solution(made_of(links([k - 1 for k in range(9)]))).order
+    order = link_multipliers.solution(read_system(links([k - 1 for k in range(9)]))).order
     assert set(order[:5]) == {0, 2, 4, 6, 8}
     assert set(order[5:7]) == {1, 7}
 
 
 def test_divisions_do_not_depend_on_one_another() -> None:
     """No reciprocal that depends on the position enters another one."""
-    function = by_multipliers(made_of(links([k - 1 for k in range(12)])))
+    function = by_multipliers(read_system(links([k - 1 for k in range(12)])))
     values = {a.name: a.value for a in function.body}
 
     def sequential_divisions(name: str) -> int:
@@ -107,7 +107,7 @@ def test_scaled_masses_give_the_same_accelerations(
 ) -> None:
     """Products of pivots stay in the range of a double; only mass ratios matter."""
     monkeypatch.setattr(ldl, "MAX_PIVOTS_PER_PRODUCT", longest)
-    system = made_of(links([k - 1 for k in range(n)], equal=False))
+    system = read_system(links([k - 1 for k in range(n)], equal=False))
     function, state = by_multipliers(system), states(system)[0] | {"b": 0.0, "s": 0.0, "u": 0.0}
     scaled = {**state, **{f"m{k}": size * state[f"m{k}"] for k in range(n)}}
     (expected, _), (result, regular) = evaluate(function, state), evaluate(function, scaled)
@@ -123,8 +123,8 @@ def test_products_of_pivots_are_accurate(n: int) -> None:
     product may contain.
     """
     chain = links([k - 1 for k in range(n)], equal=False)
-    system = made_of(chain)
-    prompt, plain = by_multipliers(system), by_multipliers(made_of(chain + BATCH))
+    system = read_system(chain)
+    prompt, plain = by_multipliers(system), by_multipliers(read_system(chain + BATCH))
     assert prompt != plain
     for state in states(system, 2):
         (result, _), (expected, _) = (evaluate(f, state, exact=True) for f in (prompt, plain))
@@ -134,7 +134,7 @@ def test_products_of_pivots_are_accurate(n: int) -> None:
 
 def test_single_precision_has_no_range_for_products_of_pivots() -> None:
     chain = links([k - 1 for k in range(9)])
-    plain, many = (by_multipliers(made_of(f"{chain}\n[run]\n{run}\n")) for run in (
+    plain, many = (by_multipliers(read_system(f"{chain}\n[run]\n{run}\n")) for run in (
         'real = "float"', "batch = true",
     ))  # fmt: skip
     assert plain == many
@@ -142,7 +142,7 @@ def test_single_precision_has_no_range_for_products_of_pivots() -> None:
 
 @pytest.mark.parametrize("n", tiers((3, 5, 10), 3))
 def test_route_is_chosen_where_it_is_the_cheapest(n: int) -> None:
-    system = made_of(links([k - 1 for k in range(n)]))
+    system = read_system(links([k - 1 for k in range(n)]))
     assert cheapest(system)[0].route == "multipliers"
 
 
@@ -178,7 +178,7 @@ def test_negative_mass_is_reported() -> None:
     system = System.make(
         "negative",
         [a, b],
-        sum(dot(e) ** 2 for e in FIRST) - 2 * sum(dot(e) ** 2 for e in hung(FIRST, R, b)),
+        sum(dot(e) ** 2 for e in FIRST) - 2 * sum(dot(e) ** 2 for e in link_end(FIRST, R, b)),
         0,
         parameters=PARAMETERS,
     )
@@ -198,8 +198,8 @@ def test_angles_that_do_not_determine_the_coordinates() -> None:
 @pytest.mark.parametrize("name", ["m", "l", "m1", "l1", "m0", "l0"])
 def test_zero_mass_or_length_is_singular(name: str) -> None:
     """Even where all terms that contain it cancel."""
-    function = by_multipliers(made_of(links([-1, 0, 1], equal=len(name) == 1)))
-    state = states(made_of(links([-1, 0, 1], equal=len(name) == 1)))[0]
+    function = by_multipliers(read_system(links([-1, 0, 1], equal=len(name) == 1)))
+    state = states(read_system(links([-1, 0, 1], equal=len(name) == 1)))[0]
     assert evaluate(function, state)[1]
     try:
         _, regular = evaluate(function, {**state, name: 0.0})
@@ -213,7 +213,7 @@ def test_singular_and_regular_states_in_c(modules: Modules) -> None:
     module = modules.unoptimised(links([-1, 0, 1, 2], more='potential = "0"'))
     q, qd = np.array([0.1, 0.4, -0.3, 0.8]), np.array([1.0, -0.5, 0.7, 0.2])
     state = {f"q{k}": v for k, v in enumerate(q)} | {f"q{k}_dot": v for k, v in enumerate(qd)}
-    text = made_of(links([-1, 0, 1, 2], more='potential = "0"'))
+    text = read_system(links([-1, 0, 1, 2], more='potential = "0"'))
     reference, _ = independent(
         text, {**{p.name: p.value for p in text.parameters}, **state, "u": 0, "t": 0}
     )
@@ -227,8 +227,8 @@ def test_singular_and_regular_states_in_c(modules: Modules) -> None:
 def test_massless_link_uses_the_route_by_the_mass_matrix() -> None:
     """D is regular with m0 = 0 if the links are not collinear, but 1/m0 does not exist."""
     text = links([-1, 0, 1, 2], equal=False)
-    assert cheapest(made_of(text))[0].route == "multipliers"
-    system = made_of(text.replace("m0 = 1.0", "m0 = 0.0"))
+    assert cheapest(read_system(text))[0].route == "multipliers"
+    system = read_system(text.replace("m0 = 1.0", "m0 = 0.0"))
     best, _ = cheapest(system)
     assert "multipliers" in dict(best.routes)
     assert best.route != "multipliers"

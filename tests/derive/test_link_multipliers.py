@@ -27,13 +27,13 @@ from links import (
     c,
     cheapest,
     cos,
-    hung,
     independent,
     k,
+    link_end,
     links,
     m,
-    made_of,
     moving,
+    read_system,
     sin,
     states,
     x,
@@ -107,7 +107,7 @@ WAYS = pytest.mark.parametrize(
 @pytest.mark.parametrize("shape", tiers(SHAPES, "pendulum", "fork"))
 @WAYS
 def test_masses_on_links_agree_with_lagrange(shape: str, equal: bool, relative: bool) -> None:
-    assert_agrees_with_lagrange(made_of(links(SHAPES[shape], equal, relative)))
+    assert_agrees_with_lagrange(read_system(links(SHAPES[shape], equal, relative)))
 
 
 EVERYTHING = """potential = "m1*g*y1 + s*(x2 - 0.3)**2/2 + s*(q1 - q0)**2/2 + s*sin(q2)*y0*x1"
@@ -121,18 +121,18 @@ q2 = "sin(2*t) + u*x1" """
 def test_forces_inputs_and_a_driven_pivot_agree_with_lagrange(equal: bool, relative: bool) -> None:
     more = EVERYTHING.replace("m1*", "m*") if equal else EVERYTHING
     assert_agrees_with_lagrange(
-        made_of(links([-1, 0, 1], equal, relative, pivot="b*sin(3*t)", more=more))
+        read_system(links([-1, 0, 1], equal, relative, pivot="b*sin(3*t)", more=more))
     )
 
 
 @pytest.mark.parametrize("relative", tiers([False, True], False), ids=["absolute", "relative"])
 def test_explicit_positions_are_recognised(relative: bool) -> None:
     costs = {
-        by_multipliers(made_of(links(CHAIN, relative=relative, written=written))).cost
+        by_multipliers(read_system(links(CHAIN, relative=relative, written=written))).cost
         for written in (False, True)
     }
     assert len(costs) == 1
-    assert_agrees_with_lagrange(made_of(links([-1, 0, 0, 2], False, relative, written=True)))
+    assert_agrees_with_lagrange(read_system(links([-1, 0, 0, 2], False, relative, written=True)))
 
 
 @FEW
@@ -152,7 +152,7 @@ def check_a_tree(data: Any) -> None:
     n = data.draw(st.integers(1, 6))
     parents = [data.draw(st.integers(-1, k - 1)) for k in range(n)]
     equal, relative, written = (data.draw(st.booleans()) for _ in range(3))
-    assert_agrees_with_lagrange(made_of(links(parents, equal, relative, written)))
+    assert_agrees_with_lagrange(read_system(links(parents, equal, relative, written)))
 
 
 # --- what else is of this kind --------------------------------------------------------------------
@@ -160,23 +160,23 @@ def check_a_tree(data: Any) -> None:
 
 def double_pendulum(first: tuple[Any, Any], q: list[Any], angle: Any = b, **others: Any) -> System:
     """Return a mass and a second one suspended from it."""
-    return moving([first, hung(first, R, angle)], q, **others)
+    return moving([first, link_end(first, R, angle)], q, **others)
 
 
 O = (0, 0)  # noqa: E741 - the origin's name
-ON_CART = hung((x, 0), L, a)
+ON_CART = link_end((x, 0), L, a)
 SIDEWAYS = {x: L * sin(a), y: -L * cos(a), c: x + L * sin(b), R: y - L * cos(b)}
 
 KINDS = {
     "cart and pendulum": moving([(x,), ON_CART], [x, a]),
     "a double pendulum on a cart": moving(
-        [(x,), ON_CART, hung(ON_CART, R, b)],
+        [(x,), ON_CART, link_end(ON_CART, R, b)],
         [x, a, b],
         potential=k * (x**2 + cos(a) + 2 * cos(b) + x * b) / 3,
     ),
     "a wheel beside": moving([(x,), ON_CART], [x, a, b], m * B_DOT**2, potential=k * (x - b) ** 2),
     "rotors": double_pendulum(
-        hung(O, L, a),
+        link_end(O, L, a),
         [a, b, c],
         more=(R * A_DOT**2 + k * C_DOT**2) / 2,
         potential=k * cos(a - c),
@@ -184,14 +184,14 @@ KINDS = {
     "on a parabola": double_pendulum((a, a**2), [a, b]),
     "on an ellipse": moving([(2 * cos(a), sin(a)), (2 * cos(a) + b, sin(a))], [a, b]),
     "other axes": double_pendulum((L * cos(a), L * sin(a)), [a, b]),
-    "from an angle": double_pendulum(hung(O, L, a + k), [a, b], 2 * b),
+    "from an angle": double_pendulum(link_end(O, L, a + k), [a, b], 2 * b),
     "in one factor": moving(
-        [hung(O, L, a), (L * (sin(a) + sin(b)), -L * (cos(a) + cos(b)))], [a, b]
+        [link_end(O, L, a), (L * (sin(a) + sin(b)), -L * (cos(a) + cos(b)))], [a, b]
     ),
-    "halfway": moving([hung(O, L / 2, a), hung(hung(O, L, a), R, b)], [a, b]),
-    "growing": double_pendulum(hung((0, t**2), t, a), [a, b], b - t),
+    "halfway": moving([link_end(O, L / 2, a), link_end(link_end(O, L, a), R, b)], [a, b]),
+    "growing": double_pendulum(link_end((0, t**2), t, a), [a, b], b - t),
     "sums and differences": double_pendulum(
-        hung(O, L, a - 2 * b), [a, b], a + b / 3, forces={a: A_DOT * k, b: a - 3 * b}
+        link_end(O, L, a - 2 * b), [a, b], a + b / 3, forces={a: A_DOT * k, b: a - 3 * b}
     ),
     "heavier sideways": System.make(
         "sideways",
@@ -212,9 +212,9 @@ def test_other_suitable_systems_agree_with_lagrange(kind: str) -> None:
 @pytest.mark.slow
 def test_point_bodies_in_relative_angles_agree_with_lagrange() -> None:
     """Their world coordinates depend on sums of angles."""
-    system = made_of(trees.chain(4, points=True))
+    system = read_system(trees.chain(4, points=True))
     assert system.tree is not None
     assert_agrees_with_lagrange(system)
-    best, _ = cheapest(made_of(trees.chain(10, points=True)))
+    best, _ = cheapest(read_system(trees.chain(10, points=True)))
     assert best.route == "multipliers"
     assert {"articulated", "multipliers"} <= dict(best.routes).keys()

@@ -39,7 +39,7 @@ def test_guesses_within_a_fifth_are_assembled(first: int) -> None:
             continue
         count += 1
         q = np.array([c.start for c in system.coordinates])
-        np.testing.assert_array_equal(q[chain_case.held], chain_case.q[chain_case.held])
+        np.testing.assert_array_equal(q[chain_case.fixed], chain_case.q[chain_case.fixed])
         closure = system.closure
         assert closure is not None
         assert (closure.rank, len(closure.redundant)) == (2, chain_case.extra)

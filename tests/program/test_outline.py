@@ -13,7 +13,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from builds import KEPT
+from builds import REUSED_BUILDS
 from cases import SCENES, fast_kit, scene_system
 from compilers import STRICT, compiled
 from conftest import EVERYTHING, Modules, needs, tiers
@@ -267,7 +267,7 @@ def test_compile_time_grows_linearly_with_the_size(tmp_path: Path) -> None:
 @pytest.fixture
 def root(request: pytest.FixtureRequest) -> Path:
     """Return the cache folder for modules of a test, valid while this file is unchanged."""
-    return KEPT / "outline" / re.sub(r"\W+", "_", request.node.name)
+    return REUSED_BUILDS / "outline" / re.sub(r"\W+", "_", request.node.name)
 
 
 def load_program(program: Program, root: Path) -> ModuleType:

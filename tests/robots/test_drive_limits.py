@@ -54,7 +54,7 @@ def mjcf(*joints: str) -> str:
 
 def import_scene(folder: Path, text: str, *words: str) -> tuple[str, dict]:
     """Import a robot; return the command's output and the parsed scene."""
-    output, scene = mjcf_text.imported(folder, text, *words)
+    output, scene = mjcf_text.import_robot(folder, text, *words)
     return output, tomllib.loads(scene)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mjcf_text import imported, model
+from mjcf_text import import_robot, model
 
 from eomc.derive.lagrange import derive
 from eomc.model.from_scene import from_scene
@@ -49,7 +49,7 @@ def equations(robot: Robot, q: list[float], qd: list[float], values: Mapping[str
 
 def test_masses_and_the_payload_are_parameters(tmp_path: Path) -> None:
     text = f"<mujoco><worldbody>{ARM.format(more='')}</worldbody></mujoco>"
-    _, scene = imported(tmp_path, text, "--parameters", "masses")
+    _, scene = import_robot(tmp_path, text, "--parameters", "masses")
     parsed = tomllib.loads(scene)
     assert list(parsed["parameters"]) == ["mass_upper", "mass_fore", "payload"]
     assert parsed["parameters"]["payload"] == {

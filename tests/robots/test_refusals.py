@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from mjcf_text import imported
+from mjcf_text import import_robot
 
 NOTE = "not read of this file, which may be the cause:"
 BALL = '<geom size=".1" pos=".3 0 0"/>'
@@ -33,7 +33,7 @@ def test_ignored_elements_that_create_others_are_named(
     kind = maker.split()[0]
     inside = world.replace("*", f"<{maker}>{PART}</{kind}>")
     file = f"<mujoco><worldbody>{inside}</worldbody>{sections}</mujoco>"
-    output, scene = imported(tmp_path, file)
+    output, scene = import_robot(tmp_path, file)
     assert not scene and fault in output and NOTE in output
     listed = output[output.index(NOTE) :]
     assert f"  - <{kind}> and all that it adds, joints and masses too" in listed
@@ -45,11 +45,11 @@ def test_joints_of_other_namespaces_are_named(tmp_path: Path) -> None:
     links = LINK.format("a") + LINK.format("b")
     for prefix in ("drake:", "my_"):
         file = f'<robot name="r" xmlns:drake="d">{links}{joint.format(prefix)}</robot>'
-        output, scene = imported(tmp_path, file)
+        output, scene = import_robot(tmp_path, file)
         assert not scene and "2 links have no parent" in output
         assert f"; <{prefix}joint> is not read, only <joint> is" in output
         assert f"  - elements that URDF does not have: {prefix}joint in robot" in output
-    output, scene = imported(tmp_path, f'<robot name="r">{links}</robot>')
+    output, scene = import_robot(tmp_path, f'<robot name="r">{links}</robot>')
     assert not scene and "only <joint> is" not in output and NOTE not in output
 
 
@@ -57,9 +57,9 @@ def test_options_that_name_ignored_elements_are_refused_with_the_list(tmp_path: 
     inside = ONE.format(f'{BALL}<replicate count="2">{PART}</replicate>')
     file = f"<mujoco><worldbody>{inside}</worldbody></mujoco>"
     for words in (("--lock", "k0=1"), ("--root", "f0"), ("--tip", "f1")):
-        output, scene = imported(tmp_path, file, *words)
+        output, scene = import_robot(tmp_path, file, *words)
         assert not scene and NOTE in output and "<replicate>" in output
-    output, scene = imported(tmp_path, file, "--name", "no name")
+    output, scene = import_robot(tmp_path, file, "--name", "no name")
     assert not scene and NOTE not in output
-    output, scene = imported(tmp_path, file)
+    output, scene = import_robot(tmp_path, file)
     assert scene and NOTE not in output and "<replicate>" in output

@@ -260,7 +260,7 @@ def test_effort_of_stops_includes_servos_and_tendons(tmp_path: Path) -> None:
 
 def test_without_drives_no_tendon_is_reported_as_idle(tmp_path: Path) -> None:
     text = f"<mujoco>{BEFORE}<worldbody>{ARM}</worldbody>{AFTER}</mujoco>"
-    _, scene = mjcf_text.imported(tmp_path, text, "--no-drives")
+    _, scene = mjcf_text.import_robot(tmp_path, text, "--no-drives")
     assert list(tomllib.loads(scene)["definitions"]) == ["sum", "a_2"]
 
 
@@ -287,7 +287,7 @@ def test_motion_of_arms_agrees_with_mujoco(
     """Compare accelerations at random states, and a run from the key frame with its controls."""
     mujoco = pytest.importorskip("mujoco", minversion="4")
     text = f"<mujoco>{BEFORE}<worldbody>{ARM}</worldbody>{AFTER}</mujoco>".replace(ROPE, "")
-    mjcf_text.imported(tmp_path, text, *words)
+    mjcf_text.import_robot(tmp_path, text, *words)
     m = eomc.load(tmp_path / "robot.toml", tmp_path)
     theirs = mujoco.MjModel.from_xml_string(text)
     off = mujoco.mjtDisableBit

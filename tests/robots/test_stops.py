@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import tiers
-from mjcf_text import imported
+from mjcf_text import import_robot
 
 import eomc
 
@@ -29,7 +29,7 @@ pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
 
 def test_full_effort_pushes_a_joint_into_its_stop_by_the_stop_depth(tmp_path: Path) -> None:
-    output, scene = imported(tmp_path, URDF, "--stops")
+    output, scene = import_robot(tmp_path, URDF, "--stops")
     assert (
         "at limits of positions [forces] pushes back" in output
         and "limits of 1 joint" not in output
@@ -47,7 +47,7 @@ def test_full_effort_pushes_a_joint_into_its_stop_by_the_stop_depth(tmp_path: Pa
 @pytest.mark.parametrize("side", tiers([1, -1], 1))
 def test_restitution_of_a_stop_decreases_with_speed(side: int, tmp_path: Path) -> None:
     """Hunt and Crossley: 1 - 2/3 d v for the speed v, to first order, for any mass and k."""
-    imported(tmp_path, URDF, "--stops")
+    import_robot(tmp_path, URDF, "--stops")
     m = eomc.load(eomc.read(tmp_path / "robot.toml"), tmp_path)
     for v, d in ((0.1, 0.1), (0.1, 0.3), (0.02, 1.0)):
         run = m.simulate(
@@ -61,7 +61,7 @@ def test_restitution_of_a_stop_decreases_with_speed(side: int, tmp_path: Path) -
 def test_without_an_effort_the_weight_is_used(tmp_path: Path) -> None:
     """3 kg at 10 m/s^2 on a lever of 1 m: at speed v a bob enters by v sqrt(I/k)."""
     motor = '<actuator><motor joint="q" gear="50"/></actuator></mujoco>'  # without limits
-    output, scene = imported(tmp_path, MJCF.replace("</mujoco>", motor), "--stops")
+    output, scene = import_robot(tmp_path, MJCF.replace("</mujoco>", motor), "--stops")
     assert "effort is not known" in output and "from weights: q (30 N m)" in output
     assert "from weights: q (30 N m)" in scene.replace("\n#", "")
     assert 'q = "30/stop_depth_turn*(max(0, -0.5 - q)' in scene and "max(0, q - 0.7)" in scene
@@ -90,7 +90,7 @@ def test_effort_is_the_force_of_the_motors(
 ) -> None:
     text = MJCF.replace("<joint ", f"<joint {of_joint} ")
     text = text.replace("</mujoco>", f"<actuator>{actuators}</actuator></mujoco>")
-    output, scene = imported(tmp_path, text, "--stops", *more)
+    output, scene = import_robot(tmp_path, text, "--stops", *more)
     assert "effort is not known" not in output
     assert f"{effort}/stop_depth_turn*(max(0, -0.5 - q)" in scene
 
@@ -99,12 +99,14 @@ def test_effort_of_a_servo_is_its_force_range(tmp_path: Path) -> None:
     servo = '<position joint="q" kp="40" ctrlrange="-1 1" ctrllimited="true"/>'
     text = MJCF.replace("</mujoco>", f"<actuator>{servo}</actuator></mujoco>")
     for more, weight_is_used in (("", True), (' forcerange="-7 7" forcelimited="true"', False)):
-        output, scene = imported(tmp_path, text.replace("/></act", f"{more}/></act"), "--stops")
+        output, scene = import_robot(tmp_path, text.replace("/></act", f"{more}/></act"), "--stops")
         assert ("from weights: q (30 N m)" in output) == weight_is_used
         assert f"{30 if weight_is_used else 7}/stop_depth_turn*(max" in scene
         (tmp_path / "robot.toml").unlink()
 
 
 def test_stops_need_limits(tmp_path: Path) -> None:
-    output, scene = imported(tmp_path, MJCF.replace('limited="true"', 'limited="false"'), "--stops")
+    output, scene = import_robot(
+        tmp_path, MJCF.replace('limited="true"', 'limited="false"'), "--stops"
+    )
     assert "no joint of this robot has limits" in output and not scene

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import EVERYTHING
-from states import QD, Q, same
+from states import QD, Q, runs_are_equal
 
 from eomc.emit.package import FUNCTIONS, OPTIONAL
 from eomc.model.system import System
@@ -136,7 +136,7 @@ def test_many_states_equal_single_states(driven: ModuleType, name: str) -> None:
 def test_array_like_arguments_are_accepted(cartpole: ModuleType, values: Any) -> None:
     assert np.array_equal(cartpole.D(values), cartpole.D(np.array([1.0, 2.0])))
     run, expected = (cartpole.simulate(x, x, steps=3) for x in (values, np.array([1.0, 2.0])))
-    assert same(run, expected)
+    assert runs_are_equal(run, expected)
 
 
 def test_numbers_whose_sum_overflows_are_finite(cartpole: ModuleType) -> None:

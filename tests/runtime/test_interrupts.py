@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 from conftest import tiers
-from states import QD, Q, same
+from states import QD, Q, runs_are_equal
 
 
 def test_gil_is_released_during_a_run(cartpole: ModuleType) -> None:
@@ -52,7 +52,7 @@ def test_threads_do_not_affect_each_other(driven: ModuleType) -> None:
         thread.start()
     for thread in threads:
         thread.join()
-    assert all(same(a, b) for a, b in zip(sequential, concurrent, strict=True))
+    assert all(runs_are_equal(a, b) for a, b in zip(sequential, concurrent, strict=True))
 
 
 @contextlib.contextmanager
@@ -81,7 +81,7 @@ def test_ctrl_c_returns_the_run_so_far(cartpole: ModuleType, every: int, delay: 
     assert run.status == "interrupted"
     assert 0 < run.steps < 20_000_000
     assert "interrupted" in run.message
-    assert same(run, cartpole.simulate(steps=run.steps, every=every))
+    assert runs_are_equal(run, cartpole.simulate(steps=run.steps, every=every))
 
 
 def test_ctrl_c_is_handled_soon(cartpole: ModuleType) -> None:
@@ -100,7 +100,7 @@ def test_ctrl_c_in_the_progress_callback(driven: ModuleType) -> None:
         driven.simulate(steps=10**6, every=9, progress=stop)
     run = interruption.value.run
     assert 10_000 < run.steps < 10**6
-    assert same(run, driven.simulate(steps=run.steps, every=9))
+    assert runs_are_equal(run, driven.simulate(steps=run.steps, every=9))
 
 
 @pytest.mark.parametrize("steps", [10, 10**6])
@@ -114,7 +114,7 @@ def test_ctrl_c_in_the_first_poll_leaves_completed_steps(cartpole: ModuleType, s
         cartpole.simulate(steps=steps, every=3, progress=stop)
     run = interruption.value.run
     assert (run.status, 0 < run.steps <= steps) == ("interrupted", True)
-    assert same(run, cartpole.simulate(steps=run.steps, every=3))
+    assert runs_are_equal(run, cartpole.simulate(steps=run.steps, every=3))
 
 
 def test_ctrl_c_before_the_first_step_leaves_the_start(driven: ModuleType) -> None:
@@ -138,4 +138,4 @@ def test_ctrl_c_in_an_input_function(driven: ModuleType) -> None:
         driven.simulate(h=0.01, steps=1000, every=4, u=law)
     run = interruption.value.run
     assert run.steps == 51
-    assert same(run, driven.simulate(h=0.01, steps=51, every=4, u=0.1))
+    assert runs_are_equal(run, driven.simulate(h=0.01, steps=51, every=4, u=0.1))

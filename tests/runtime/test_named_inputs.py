@@ -9,7 +9,7 @@ import batches
 import numpy as np
 import pytest
 import sympy
-from states import QD, Q, same
+from states import QD, Q, runs_are_equal
 from sympy.physics.mechanics import dynamicsymbols
 
 S, SD = [0.3, 0.4, 0.5], [0.2, -0.1, 0.3]
@@ -29,15 +29,15 @@ def test_run_takes_inputs_by_name(everything: ModuleType, driven: ModuleType) ->
     options: dict[str, Any] = {"steps": 5, "h": 0.01}
     by_name = {"u": 0.5, "push": table}
     as_table = np.column_stack([np.full(5, 0.5), table])
-    assert same(
+    assert runs_are_equal(
         everything.simulate(u=by_name, **options), everything.simulate(u=as_table, **options)
     )
     constant = everything.simulate(u={"push": 1, "u": 0.5}, **options)
-    assert same(constant, everything.simulate(u=[0.5, 1.0], **options))
+    assert runs_are_equal(constant, everything.simulate(u=[0.5, 1.0], **options))
     by_law = everything.simulate(
         u=lambda t, q, qd: {"u": 0.5, "push": np.sin(round(100 * t))}, **options
     )
-    assert same(by_law, everything.simulate(u=as_table, **options))
+    assert runs_are_equal(by_law, everything.simulate(u=as_table, **options))
     assert everything.advice(h=1e3, u={"u": 0.5, "push": 1}) == everything.advice(
         h=1e3, u=[0.5, 1.0]
     )
@@ -64,7 +64,7 @@ def test_symbols_of_sympy_are_names(driven: ModuleType) -> None:
     """Symbols name parameters and inputs, in runs and batches; dynamicsymbols work too."""
     m_c, force = sympy.Symbol("m_c", positive=True), dynamicsymbols("force")
     run = driven.simulate(params={m_c: 3.0}, u={force: 0.5}, steps=5)
-    assert same(run, driven.simulate(params={"m_c": 3.0}, u={"force": 0.5}, steps=5))
+    assert runs_are_equal(run, driven.simulate(params={"m_c": 3.0}, u={"force": 0.5}, steps=5))
     m, options = batches.module("cartpole_driven"), {"q0": [Q, Q], "steps": 5}
     by_symbol = m.simulate_batch(params={m_c: [2.0, 3.0]}, u={force: [0.5, 1.0]}, **options)
     assert by_symbol == m.simulate_batch(params={"m_c": [2, 3]}, u={"force": [0.5, 1.0]}, **options)

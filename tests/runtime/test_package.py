@@ -84,7 +84,7 @@ def test_modules_are_independent_of_each_other(
     assert driven.Params is not cartpole.Params
 
 
-@pytest.mark.usefixtures("quickly_compiled", "found")
+@pytest.mark.usefixtures("quickly_compiled", "existing_build")
 def test_changed_scene_is_a_new_module_in_the_same_process(scene: Path, root: Path) -> None:
     """The old module still works."""
     old = eomc.load(scene, root)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import sympy
 from conftest import Modules
-from links import made_of
+from links import read_system
 from scipy.integrate import solve_ivp
 
 import eomc
@@ -266,14 +266,14 @@ def test_systems_from_python_can_stick() -> None:
 
 
 def test_assembly_of_a_start_is_reported() -> None:
-    messages = [str(w) for w in assembled(made_of(FOUR_BAR)).warnings]
+    messages = [str(w) for w in assembled(read_system(FOUR_BAR)).warnings]
     assert any("the start is assembled: q2 = " in text for text in messages)
 
 
 def test_names_of_modes_are_reserved() -> None:
     text = BLOCK.replace("k  = 10.0", "k  = 10.0\nx_slides = 1.0")
     with pytest.raises(SceneError, match=r"needs the name 'x_slides': rename yours"):
-        made_of(text)
+        read_system(text)
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 from conftest import Modules, tiers
-from links import made_of
+from links import read_system
 
 import eomc
 
@@ -164,7 +164,7 @@ def test_one_body_rests_while_another_moves(modules: Modules) -> None:
 @pytest.mark.usefixtures("quickly_compiled")
 @pytest.mark.parametrize("text", tiers([JOINT, BOUNDED], BOUNDED), ids=["smooth", "bounded"])
 def test_portable_form_rests_too(modules: Modules, text: str, tmp_path: Path) -> None:
-    fast, portable = modules.unoptimised(text), eomc.load(made_of(text), tmp_path, form="plain")
+    fast, portable = modules.unoptimised(text), eomc.load(read_system(text), tmp_path, form="plain")
     for tol in (1e-3, 1e-10):
         run, portable_run = fast.simulate(tol=tol), portable.simulate(tol=tol)
         assert_rests_until_slip(portable_run)

@@ -13,7 +13,7 @@ import pytest
 from cases import SCENES, scene_system
 from conftest import MODULES, Modules
 from scipy.integrate import solve_ivp
-from states import QD, Q, close, same
+from states import QD, Q, assert_close, runs_are_equal
 
 import eomc
 from eomc.verify.symbolic import derive
@@ -27,7 +27,7 @@ def test_run_can_continue_in_its_output_arrays(driven: ModuleType) -> None:
     expected = driven.simulate(first.q[-1].copy(), first.qd[-1].copy(), steps=10, every=3, u=u)
     continued = driven.simulate(rows[0][-1], rows[1][-1], steps=10, every=3, u=u, out=rows)
     assert continued.q is rows[0]
-    assert same(expected, continued)
+    assert runs_are_equal(expected, continued)
 
 
 @pytest.mark.parametrize("steps", [0, 1, 9, 10])
@@ -40,7 +40,7 @@ def test_few_steps_by_the_fast_path_equal_those_by_the_general_path(
     general = driven.simulate(progress=lambda finished, total: None, **arguments)
     monkeypatch.setattr(driven._model.integrator, "run", None)
     fast = driven.simulate(**arguments)
-    assert same(general, fast)
+    assert runs_are_equal(general, fast)
     for name in ("h", "steps", "status", "every", "method", "evaluations", "message"):
         assert getattr(general, name) == getattr(fast, name)
     assert fast.q is fast.q
@@ -133,8 +133,8 @@ def test_run_equals_repeated_steps(modules: Modules, name: str) -> None:
     q, qd = module.start
     for k in range(300):
         q, qd = module.step(q, qd, t=run.t[k])
-        close(q, run.q[k + 1])
-        close(qd, run.qd[k + 1])
+        assert_close(q, run.q[k + 1])
+        assert_close(qd, run.qd[k + 1])
 
 
 def test_run_under_inputs_equals_repeated_steps(driven: ModuleType) -> None:
@@ -143,7 +143,7 @@ def test_run_under_inputs_equals_repeated_steps(driven: ModuleType) -> None:
     q, qd = np.array(Q), np.array(QD)
     for k in range(50):
         q, qd = driven.step(q, qd, t=run.t[k], u=table[k], params={"l": 1.5})
-    close([q, qd], [run.q[-1], run.qd[-1]])
+    assert_close([q, qd], [run.q[-1], run.qd[-1]])
 
 
 def test_run_from_a_later_time_equals_repeated_steps(driven: ModuleType) -> None:
@@ -152,7 +152,7 @@ def test_run_from_a_later_time_equals_repeated_steps(driven: ModuleType) -> None
     q, qd = driven.start
     for k in range(200):
         q, qd = driven.step(q, qd, 0.003, t=run.t[k])
-    close([q, qd], [run.q[-1], run.qd[-1]])
+    assert_close([q, qd], [run.q[-1], run.qd[-1]])
 
 
 def test_long_run_in_parts_is_the_same(cartpole: ModuleType) -> None:
@@ -182,20 +182,20 @@ def test_polling_leaves_no_trace(driven: ModuleType) -> None:
     values = iter(table)
     with warnings.catch_warnings(action="ignore"):
         one_by_one = driven.simulate(steps=steps, every=7, u=lambda t, q, qd: next(values))
-    assert same(run, one_by_one)
+    assert runs_are_equal(run, one_by_one)
 
 
 def test_input_can_be_constant_a_table_or_a_function(driven: ModuleType) -> None:
     """All three hold u constant over each step."""
     h, steps = 0.01, 200
     constant = driven.simulate(h=h, steps=steps, u=0.5)
-    assert same(constant, driven.simulate(h=h, steps=steps, u=[0.5]))
-    assert same(constant, driven.simulate(h=h, steps=steps, u=np.full(steps, 0.5)))
-    assert same(constant, driven.simulate(h=h, steps=steps, u=np.full((steps, 1), 0.5)))
+    assert runs_are_equal(constant, driven.simulate(h=h, steps=steps, u=[0.5]))
+    assert runs_are_equal(constant, driven.simulate(h=h, steps=steps, u=np.full(steps, 0.5)))
+    assert runs_are_equal(constant, driven.simulate(h=h, steps=steps, u=np.full((steps, 1), 0.5)))
     table = driven.simulate(h=h, steps=steps, u=np.sin(h * np.arange(steps)))
     with warnings.catch_warnings(action="ignore"):
         by_function = driven.simulate(h=h, steps=steps, u=lambda t, q, qd: np.sin(t))
-    assert same(table, by_function)
+    assert runs_are_equal(table, by_function)
     assert not np.array_equal(table.q, constant.q)
 
 

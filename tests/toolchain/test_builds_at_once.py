@@ -6,7 +6,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-from builds import CHANGED, FRESH, TEXT, gravity, leftovers, started
+from builds import CHANGED, FRESH, TEXT, gravity, leftovers, start_build
 from instrument import in_a_fork
 
 import eomc
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
 @pytest.mark.usefixtures("quickly_compiled")
 def test_module_replaced_by_another_build_is_not_loaded(
-    scene: Path, root: Path, found: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scene: Path, root: Path, existing_build: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A scene of the same name is built between this build and its loading, which is repeated."""
     other, load, times = tmp_path / "other.toml", cache.load, 0
@@ -41,7 +41,7 @@ def test_module_replaced_by_another_build_is_not_loaded(
 
 @pytest.mark.usefixtures("quickly_compiled")
 def test_module_with_the_manifest_of_another_build_is_not_loaded(
-    scene: Path, root: Path, found: None, tmp_path: Path
+    scene: Path, root: Path, existing_build: None, tmp_path: Path
 ) -> None:
     """The manifest, which is moved last, is still the old one."""
     folder, other = root / "simple_pendulum", tmp_path / "other.toml"
@@ -61,7 +61,7 @@ def test_module_with_the_manifest_of_another_build_is_not_loaded(
 
 def test_two_simultaneous_builds_succeed(scene: Path, root: Path) -> None:
     """One of them builds; the other waits and uses the result."""
-    both = [started(scene, root) for _ in range(2)]
+    both = [start_build(scene, root) for _ in range(2)]
     for process in both:
         process.join(60)
     assert sorted(str(process.exitcode) for process in both) == [str(FRESH), str(FRESH - 1)]
@@ -76,7 +76,7 @@ def test_simultaneous_builds_of_two_scenes_of_one_name(
     """The last module remains and is complete."""
     other = tmp_path / "other.toml"
     other.write_text(CHANGED, encoding="utf-8")
-    both = [started(file, root) for file in (scene, other)]
+    both = [start_build(file, root) for file in (scene, other)]
     for process in both:
         process.join(60)
     assert [process.exitcode for process in both] == [FRESH, FRESH]

@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from builds import CHANGED, TEXT, marks, script
+from builds import CHANGED, TEXT, file_states, script
 from click.testing import CliRunner
 from conftest import needs, tiers
 
@@ -37,7 +37,7 @@ def test_unchanged_scene_is_not_built_again(
     first = eomc.build(scene, root)
     assert first.fresh
     assert first.folder == root / "simple_pendulum"
-    before = marks(first.folder)
+    before = file_states(first.folder)
     assert {"simple_pendulum.c", "simple_pendulum.h", "main.c", "__init__.py"} <= set(before)
 
     def fail_if_called(*_: object, **__: object) -> None:
@@ -47,10 +47,12 @@ def test_unchanged_scene_is_not_built_again(
     monkeypatch.setattr(eomc, "sources", fail_if_called)
     second = eomc.build(scene, root)
     assert not second.fresh
-    assert marks(second.folder) == before
+    assert file_states(second.folder) == before
 
 
-def test_current_build_is_loaded_without_sympy(scene: Path, root: Path, found: None) -> None:
+def test_current_build_is_loaded_without_sympy(
+    scene: Path, root: Path, existing_build: None
+) -> None:
     """The command then takes a tenth of a second."""
     assert not eomc.build(scene, root).fresh
     code = "import sys, eomc; eomc.load(*sys.argv[1:]).D([0.0]); sys.exit('sympy' in sys.modules)"
@@ -144,7 +146,9 @@ def test_key_depends_on_scene_flags_compiler_and_generator(
 
 
 @pytest.mark.usefixtures("quickly_compiled")
-def test_bytecode_of_the_previous_build_is_not_used(scene: Path, root: Path, found: None) -> None:
+def test_bytecode_of_the_previous_build_is_not_used(
+    scene: Path, root: Path, existing_build: None
+) -> None:
     """Python identifies it by the second and the size of its source, which may be the same."""
     files = sorted((root / "simple_pendulum").glob("*.py"))
     future = time.time() + 100
@@ -156,7 +160,7 @@ def test_bytecode_of_the_previous_build_is_not_used(scene: Path, root: Path, fou
 
 
 def test_some_previous_builds_are_archived(
-    scene: Path, root: Path, found: None, monkeypatch: pytest.MonkeyPatch
+    scene: Path, root: Path, existing_build: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Pickled runs need them; a build of the same scene with other flags is not archived."""
     monkeypatch.setattr(cache, "MAX_ARCHIVED_BUILDS", 1)
@@ -173,7 +177,7 @@ def test_some_previous_builds_are_archived(
         assert cache.is_built(archive / keys[-1][:12], keys[-1])
 
 
-def test_manifest_without_a_required_file_is_no_build(root: Path, found: None) -> None:
+def test_manifest_without_a_required_file_is_no_build(root: Path, existing_build: None) -> None:
     """A file that is not listed would be executed unchecked."""
     folder = root / "simple_pendulum"
     manifest = json.loads((folder / cache.MANIFEST).read_text(encoding="utf-8"))
@@ -202,12 +206,12 @@ def no_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_current_build_needs_no_compiler(
-    scene: Path, root: Path, found: None, no_compiler: None
+    scene: Path, root: Path, existing_build: None, no_compiler: None
 ) -> None:
     """Whatever compiler built it; after any other change a compiler is needed."""
     built = cache.Built("simple_pendulum", root / "simple_pendulum", False)
-    before = marks(built.folder)
-    assert not eomc.build(scene, root).fresh and marks(built.folder) == before
+    before = file_states(built.folder)
+    assert not eomc.build(scene, root).fresh and file_states(built.folder) == before
     assert eomc.load(scene, root).simulate(steps=10).status == "ok"
     listed = CliRunner().invoke(main, ["list", str(scene.parent), "--build", str(root), "--json"])
     assert [row["built"] for row in json.loads(listed.output)] == [True]

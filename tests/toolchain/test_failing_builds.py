@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from builds import FRESH, TEXT, gravity, leftovers, marks, script, started
+from builds import FRESH, TEXT, file_states, gravity, leftovers, script, start_build
 from conftest import tiers
 from instrument import in_a_fork
 
@@ -26,7 +26,7 @@ def test_message_of_a_failing_compiler_is_printed(
     scene: Path, root: Path, built: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With the command; the old module remains, and no incomplete file."""
-    before = marks(root / "simple_pendulum")
+    before = file_states(root / "simple_pendulum")
     failing_compiler = script(tmp_path / "failing", "echo 'out of cheese' >&2\nexit 3\n")
     monkeypatch.setenv("CC", failing_compiler)
     with pytest.raises(eomc.EomcError) as error:
@@ -39,7 +39,7 @@ def test_message_of_a_failing_compiler_is_printed(
         "simple_pendulum.c",
     ):
         assert words in str(error.value)
-    assert marks(root / "simple_pendulum") == before
+    assert file_states(root / "simple_pendulum") == before
     assert leftovers(root) == []
     assert gravity(root) == built
     monkeypatch.delenv("CC")
@@ -184,7 +184,7 @@ def test_killed_build_leaves_the_old_module(
     This holds even if the signal did not reach the compilers.
     """
     with sleeping_compiler(tmp_path) as (cc, pids):
-        process = started(scene, root, CC=cc)
+        process = start_build(scene, root, CC=cc)
         wait_for(pids, 2)
         assert process.pid is not None
         os.kill(process.pid, how)
@@ -248,9 +248,9 @@ def test_read_only_root_is_reported(scene: Path, root: Path) -> None:
         eomc.build(scene, root)
 
 
-def test_invalid_scene_is_not_built(scene: Path, root: Path, found: None) -> None:
-    before = marks(root / "simple_pendulum")
+def test_invalid_scene_is_not_built(scene: Path, root: Path, existing_build: None) -> None:
+    before = file_states(root / "simple_pendulum")
     scene.write_text(TEXT.replace('"m*g*y"', '"m*gg*y"'), encoding="utf-8")
     with pytest.raises(eomc.SceneError, match="'gg'"):
         eomc.build(scene, root)
-    assert marks(root / "simple_pendulum") == before
+    assert file_states(root / "simple_pendulum") == before

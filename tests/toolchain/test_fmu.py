@@ -243,7 +243,7 @@ def test_states_are_stored_and_restored(version: int, hosts: list[Host]) -> None
     for each in (host, other):
         each.start()
     host.step(0.4)
-    state, at = host.kept(), host.t
+    state, at = host.saved_state(), host.t
     host.step(0.3)  # beyond an impact
     once = host.get("y", "y_dot", "x", "x_dot")
     host.restore(state)
@@ -264,7 +264,7 @@ def test_bytes_of_no_state_are_refused(version: int, hosts: list[Host]) -> None:
     host = Host(exported(BALL, version))
     hosts.append(host)
     host.start()
-    state = host.kept()
+    state = host.saved_state()
     written = bytearray(host.unit.serializeFMUState(state))
     for wrong in (bytes(written[:-1]), bytes([written[0] ^ 1]) + bytes(written[1:]), b"x"):
         with pytest.raises(Exception, match="status 3"):

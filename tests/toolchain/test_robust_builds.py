@@ -119,7 +119,7 @@ def test_foreign_package_is_not_replaced(scene: Path, root: Path) -> None:
     assert (folder / "__init__.py").read_text(encoding="utf-8") == "mine = 1"
 
 
-def test_every_bit_of_a_build_is_verified(scene: Path, root: Path, found: None) -> None:
+def test_every_bit_of_a_build_is_verified(scene: Path, root: Path, existing_build: None) -> None:
     """A damaged extension of the right size would terminate the process that loads it."""
     folder = root / "simple_pendulum"
     files = [f for f in sorted(folder.rglob("*.*")) if f.suffix not in (".json", ".pyc")]
@@ -217,7 +217,7 @@ def test_program_that_is_no_compiler_is_reported(
 
 
 def test_flags_that_are_not_utf8_are_accepted(
-    scene: Path, root: Path, found: None, monkeypatch: pytest.MonkeyPatch
+    scene: Path, root: Path, existing_build: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The build with other flags replaces the one without, once."""
     monkeypatch.setenv("EOMC_CFLAGS", "-O0 -DX=\udcff")

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from builds import KEPT
+from builds import REUSED_BUILDS
 from cases import scene_system
 from conftest import ROOT, tiers
 
@@ -185,7 +185,7 @@ QUICK = ("what Python asks for",)
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", (SCENE, "kapitza_pendulum"))
 def test_check_passes_without_breakage(scene: str) -> None:
-    report = build_and_check(KEPT / "unbroken", scene)
+    report = build_and_check(REUSED_BUILDS / "unbroken", scene)
     assert report.passed, report.table()
 
 

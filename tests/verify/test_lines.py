@@ -9,7 +9,7 @@ import pytest
 from cases import SCENES
 from compilers import compiled, run
 from conftest import needs
-from instrument import missed, unexecuted
+from instrument import check_coverage, unexecuted
 
 # other lines under [run], and the scenes that get them
 VARIANTS = {
@@ -77,7 +77,7 @@ def unexplained(name: str, text: str, folder: Path) -> list[str]:
     ones.
     """
     needs("gcov")
-    _, lines = missed(text, folder)
+    _, lines = check_coverage(text, folder)
     source = (folder / f"{name}.c").read_text(encoding="utf-8")
     excused, _ = UNREACHABLE.get(name, ("(?!)", ""))
     left = [(number, line) for number, line in lines if not re.fullmatch(excused, line)]

@@ -11,7 +11,7 @@ import pytest
 import sympy
 from cases import ALIKE, FEW_ALIKE, SCENES, case_system, cases, error_of, scene_system
 from conftest import tiers
-from stand_in import simplified
+from stand_in import simplify_reference
 from sympy import cos, sin
 
 from eomc.base.errors import EomcError
@@ -131,7 +131,7 @@ def test_values_of_the_tutorial() -> None:
     q2, q2_dot, gravity = symbol("q2"), symbol("q2_dot"), symbol("g")
     del numbers[gravity]
     reference = derive(system)
-    for equations in (reference, simplified(reference)):
+    for equations in (reference, simplify_reference(reference)):
         D, C, g = (
             m.subs(numbers).applyfunc(sympy.simplify)
             for m in (equations.D, equations.C, equations.g)
@@ -145,7 +145,7 @@ def test_values_of_the_tutorial() -> None:
 @pytest.mark.parametrize("name", ["kapitza_pendulum", "cartpole_driven"])
 def test_simplified_equations_have_the_same_values(name: str) -> None:
     reference = derive(scene_system(name))
-    short = simplified(reference)
+    short = simplify_reference(reference)
     for name in ("D", "C", "g", "bias", "tau", "kinetic", "energy", "jacobi", "power"):
         for q, qd, at in states(reference, 2):
             np.testing.assert_allclose(
