@@ -108,7 +108,7 @@ def test_python_module_uses_the_names_of_the_scene() -> None:
     one, other = (module.acceleration([0.3, 0.2], [0, 0], params=p) for p in ({}, {"EOF": 0.7}))
     assert one[0] != other[0]
     header = (BUILDS / "macros" / "macros.h").read_text(encoding="utf-8")
-    assert "Names that C can't bear: NAN is NAN_, errno is errno_" in header
+    assert "Names that are changed in C: NAN is NAN_, errno is errno_" in header
 
 
 LONG = "o = '(1234567/1234568)**64'\np = 'o**8'\n"  # with 7168 digits

@@ -148,7 +148,7 @@ def test_events_at_and_between_period_starts_are_detected_once(sampled: ModuleTy
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"u": law}, "a function is asked once a control period, .*: give control_period="),
+        ({"u": law}, "a function is called once in each control period, .*: give control_period="),
         ({"u": np.ones((4, 1))}, r"u: shape \(4, 1\), expected \(1,\).* take control_period="),
         ({"u": [1.0, 2.0]}, r"u: shape \(2,\), expected \(1,\)"),
         ({"u": np.ones((4, 1)), "control_period": 0.1}, "4 rows for 20 control periods of 0.1 s"),
@@ -173,7 +173,7 @@ def test_error_in_feedback_law_reports_time_and_state(sampled: ModuleType) -> No
     for options in ({"tol": 1e-9}, {"h": 0.0025}):
         with pytest.raises(ValueError, match="is not finite") as error:
             sampled.simulate(u=invalid_law, control_period=0.1, **options)
-        assert "u was asked at t = 0.3 s, q = [" in error.value.__notes__[0]
+        assert "u was called at t = 0.3 s, q = [" in error.value.__notes__[0]
 
 
 def test_more_control_periods_than_memory_are_refused(sampled: ModuleType) -> None:

@@ -24,10 +24,10 @@ from eomc.program.program import Program
 STATE = ("q", "qd")
 ARGUMENT_NAMES = (*STATE, "qdd", "wrenches", "lambda", "t", "u", "p")
 ROTATION_ERRORS = (
-    "2 tan(a/2) n along axes of loops, whose second frames are out by angles a about n, then "
-    "cos(a/2)^2 of each, then the derivatives of the first along q, by rows."
+    "Rotation errors of loops: 2 tan(a/2) n, if the second frame of a loop is rotated by the angle "
+    "a about n; then cos(a/2)^2 of each; then the derivatives of the errors by q, by rows."
 )
-RATE_TERMS = "Rates of rows that may be left out, then the sums of their terms' sizes."
+RATE_TERMS = "Rates of equations that may be redundant, then the sums of the sizes of their terms."
 MAX_UNCOMMENTED_LINES = 16  # statements without comments between stages
 
 

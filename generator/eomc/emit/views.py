@@ -88,7 +88,7 @@ def description(target: Target) -> list[FreeText]:
         lines.append("")
     if s.renamed:
         renamed = ", ".join(f"{line(scene_name)} is {c_name}" for scene_name, c_name in s.renamed)
-        lines += [*textwrap.wrap(f"Names that C can't bear: {renamed}.", 92), ""]
+        lines += [*textwrap.wrap(f"Names that are changed in C: {renamed}.", 92), ""]
     return list(map(FreeText, lines))
 
 

@@ -358,7 +358,7 @@ class Batch(Component):
                 f"({self.info.nu},), (batch, {self.info.nu})",
                 f"(batch, {steps}, {self.info.nu})",
             )
-            table = ": rows, each held over a control period, take control_period=, in s"
+            table = ": rows, each constant over a control period, take control_period=, in s"
             rows = ", a row for each step or control period of duration="
             over = f" or {wide}{rows}" if steps else table
             raise ValueError(f"u: shape {np.shape(u)}, expected {shapes}{over}")

@@ -610,7 +610,9 @@ class Functions(Component):
     def feedback(self, q: Array, qd: Array, u: Any, t: float, params: Any) -> Array:
         """du/dx of the scene's signals, (nu, 2 nq), with a leading n for many states."""
         if u is not None:
-            raise ValueError("closed: is for the scene's signals: give no u, which would be held")
+            raise ValueError(
+                "closed: is for the scene's signals: give no u, which would be constant"
+            )
         if not hasattr(self.c.lib, "signal_slopes"):
             raise ValueError(
                 f"closed: {self.info.name} has no loop to close: no signal is a smooth function "

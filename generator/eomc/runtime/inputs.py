@@ -16,8 +16,8 @@ from .requests import SimulationArguments
 from .status import PART
 
 NO_PERIOD = (
-    "u: a function is asked once a control period, and steps that fit a tolerance don't tell how "
-    "long that is: give control_period=, in s"
+    "u: a function is called once in each control period, and adaptive steps have no fixed "
+    "length: give control_period=, in s"
 )
 _VALUE = 200  # bytes of the stored inputs of one period
 
@@ -44,7 +44,7 @@ def evaluate_law(
             wrong = str(fault).removeprefix("u: ")
             raise ValueError(f"u: what the function returned: {wrong}") from None
     except Exception as fault:
-        fault.add_note(f"u was asked at t = {t:.9g} s, q = {q}, qd = {qd}")
+        fault.add_note(f"u was called at t = {t:.9g} s, q = {q}, qd = {qd}")
         raise
     if inputs_array is None:
         raise ValueError("u: the function returned None, not the inputs")
@@ -199,7 +199,7 @@ def input_schedule(
             raise ValueError(
                 f"u: shape {np.shape(u)}, expected ({model.info.nu},): one value an input; "
                 "rows, each "
-                "held over a control period, take control_period=, in s"
+                "constant over a control period, take control_period=, in s"
             )
         if len(rows) != (count := count_periods(span, period)):
             raise ValueError(

@@ -23,7 +23,7 @@ from .trajectory_data import Trajectory, infinite_at_start
 
 NOISE = (
     "estimate: u gives other values at the start than it gave in the run, as noise does, or what "
-    "keeps a state of its own: let it depend on t, q and qd alone"
+    "has a state of its own: let it depend on t, q and qd alone"
 )
 
 

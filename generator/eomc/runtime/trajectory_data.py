@@ -22,7 +22,7 @@ _MAX_ROUNDINGS = (
     2.0**26
 )  # residuals above this number of roundings of their terms violate a constraint
 _MIN_SCALE = 1e-9  # smallest scale of the terms
-LEFT_OUT = "u was a function, which a pickled or saved run doesn't keep: simulate again"
+LEFT_OUT = "u was a function, which a pickled or saved run does not contain: simulate again"
 _STEP_TOLERANCE = 1e-12  # times closer to a step than this fraction of h coincide with it
 
 
@@ -466,7 +466,9 @@ def _time_and_inputs(run: Trajectory, n: int) -> tuple[float, Any]:
     if not callable(u) and not isinstance(u, str):
         return t, u[min(n, len(u) - 1)]
     if run.applied_inputs is None or run.every > 1:
-        raise ValueError("u was a function, which rows don't tell: take every=1")
+        raise ValueError(
+            "u was a function, and its values between rows are not stored: take every=1"
+        )
     return t, run.applied_inputs[n]
 
 
