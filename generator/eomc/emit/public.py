@@ -70,8 +70,8 @@ KINDS: Mapping[str, Kind] = {
     "output_slopes": Kind("slopes", "y*x", "qd u qdd?",
         "Partial derivatives [dy/dq, dy/dqd, dy/du, dy/dqdd] of outputs y, by rows."),
     "output_sensitivity": Kind("slopes", "y*p", "qd u qdd?",
-        "Partial derivatives dy/dp of outputs y (q, qd, u, qdd constant), by rows, a column for each "
-        "parameter."),
+        "Partial derivatives dy/dp of outputs y (q, qd, u, qdd constant), by rows, columns for "
+        "parameters."),
     "events": Kind("events", "e", "qd u",
         "Event functions: an event occurs where its function crosses zero."),
     "begins": Kind("begins", "e", "qd u",
