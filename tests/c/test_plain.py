@@ -188,7 +188,7 @@ def test_portable_object_is_smaller_than_optimised_object(name: str, tmp_path: P
 
 
 def test_header_and_source_of_different_forms_are_refused(tmp_path: Path) -> None:
-    """Their workspaces differ."""
+    """The workspaces of the two forms differ."""
     title = kit("cartpole", tmp_path)
     (tmp_path / f"{title}.h").write_text(generated("cartpole")[f"fast/{title}.h"])
     for flags in ([], ["-ffast-math"]):

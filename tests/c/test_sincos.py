@@ -228,7 +228,9 @@ def test_compilers_agree_bit_for_bit(
 
 
 def test_without_fma_flags_disable_fma(libraries: dict[str, ctypes.CDLL]) -> None:
-    """They also disable FMA of AVX-512, with which a compiler would select the other reduction."""
+    """The flags also disable FMA of AVX-512, with which a compiler would select the other
+    reduction.
+    """
     if "vector, no FMA" not in libraries:
         pytest.skip("the compiler does not take -mno-fma")
     assert not libraries["vector, no FMA"].fast_fma() and not libraries["scalar, no FMA"].fast_fma()

@@ -136,7 +136,7 @@ def test_stages_near_a_singular_position_keep_the_run_accurate(
 
 @pytest.mark.parametrize("h", tiers([0.05, 0.04, 0.02, 0.01]))
 def test_bricard_linkage_turns_for_ten_seconds(h: float) -> None:
-    """Its fifth constraint depends on the others on the manifold only."""
+    """The fifth constraint depends on the others on the manifold only."""
     run = simulate("bricard_cube", h=h, duration=10.0)
     assert run.status == "ok" and run.singular_steps == 0
     limit = {0.05: 2.9e-2, 0.04: 1.3e-2, 0.02: 8.2e-4, 0.01: 5.2e-5}[h]

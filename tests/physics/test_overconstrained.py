@@ -157,7 +157,7 @@ def test_planar_mechanism_closes_in_a_plane_with_a_rounded_normal() -> None:
 
 @pytest.mark.parametrize("name", ["bennett", "tilted"])
 def test_redundant_constraints_with_rounded_coefficients_are_dropped(name: str) -> None:
-    """With all of them each step was reported as singular, and Bennett's linkage was locked."""
+    """With all constraints each step was reported as singular, and Bennett's linkage was locked."""
     drive = '[constraints]\ndrive = "q1 - 1 - 2*t"\n[run]'
     text = {"bennett": DRIVEN, "tilted": tilted().replace("[run]", drive)}[name]
     closure = read(text).closure
@@ -168,7 +168,7 @@ def test_redundant_constraints_with_rounded_coefficients_are_dropped(name: str) 
 
 @pytest.mark.parametrize("angle", [0.0, 0.4])  # exact numbers, or doubles
 def test_implied_constraint_without_gradient_is_dropped(angle: float) -> None:
-    """It was refused, or weighted in a sum by the inverse of its rounding error."""
+    """Such a constraint was refused, or weighted in a sum by the inverse of its rounding error."""
     closure = read(locked(angle)).closure
     assert closure is not None and closure.rank == 1 and closure.freedoms == 1
     assert "pin_y" in closure.redundant

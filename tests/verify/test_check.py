@@ -131,7 +131,7 @@ def report_of_mass_spring() -> CheckReport:
     ),
 )
 def test_correct_module_passes(name: str) -> None:
-    """Also with other arithmetic: the simplified equations round differently."""
+    """The simplified equations round differently."""
     report = check(scene_system(name), StandIn(simplify_reference(reference(name))))
     assert report.passed, report.table()
     values = [row for row in report.results if row.unit == "units of rounding"]

@@ -62,7 +62,7 @@ def test_rows_without_digits_are_compared_by_rounding(
 
 
 def test_last_row_of_a_stopped_instance_equals_a_single_run(modules: Modules) -> None:
-    """Also if it stops after its first step; an instance that continues has no digit left to
+    """This includes a stop after the first step; a running instance has no digit left to
     compare.
     """
     b = batches(modules, "-x/7")

@@ -175,7 +175,7 @@ def test_multipliers_of_negative_masses_fail(
 
 
 def test_states_with_negative_D_are_skipped() -> None:
-    """They are meaningless for a scene whose coordinates may make a mass negative."""
+    """These states are meaningless for a scene whose coordinates may make a mass negative."""
     kinetic = "(m - 2*x)*(x_dot**2 + y_dot**2)/2"
     text = SCENE.replace("m*(x_dot**2 + y_dot**2)/2", kinetic)
     system = assembled(from_scene(parse(text)))

@@ -89,7 +89,7 @@ def stiff(comparison: Comparison) -> Comparison:
 def test_differences_along_stiff_coordinates_are_not_hidden_by_rounding(
     stiff: Comparison, name: str
 ) -> None:
-    """They were, along lines shorter than the range of such a coordinate."""
+    """Lines for differences used to be shorter than the range of such a coordinate."""
     also = {"forces at frames"} if name == "jacobian" else set()
     failures = failed_checks(stiff, Wrong(stiff.module, name))
     assert failures == ({ROWS[name], *also} if name else set()), stiff.results

@@ -257,9 +257,7 @@ WIDE_SEEDS = "120 124 143 150 1088".split()  # the same for scene_author_wide
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [*map(str, range(12)), *WIDE_SEEDS])
 def test_wide_scenes_pass(seed: str, tmp_path: Path) -> None:
-    """They have outputs, limits, events, tolerances, forces, points, frames, constraints and
-    loops.
-    """
+    """Features: outputs, limits, events, tolerances, forces, points, frames, constraints, loops."""
     result = outcome(int(seed), False, tmp_path, wide=True)
     assert result.outcome == "passed", (result, wide_text(int(seed)))
 
