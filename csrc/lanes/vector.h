@@ -19,14 +19,15 @@ EOMC_INLINE eomc_LANE eomc_same_LANE(EOMC_REAL x)
     return x - zero;
 }
 
-/* Whether |x| > most; of a NaN nothing is told. */
+/* Whether |x| > most; undefined for NaN. */
 EOMC_INLINE eomc_LANE_mask eomc_exceeds_LANE(eomc_LANE x, EOMC_REAL most)
 {
     return (eomc_LANE_mask)(most - (eomc_LANE)((eomc_LANE_mask)x & EOMC_BITS_OF_SIZE));
 }
 
-/* Whether x <= 0: of a pivot less what rounding leaves of it. A NaN is not: it is not finite. */
-EOMC_INLINE eomc_LANE_mask eomc_not_positive_LANE(eomc_LANE x)
+/* Whether x <= 0, for a pivot minus its rounding error; false for NaN, which is not finite. */
+EOMC_INLINE eomc_LANE_mask
+eomc_not_positive_LANE(eomc_LANE x)
 {
     return x <= 0;
 }
