@@ -90,7 +90,7 @@ def steep(root: str) -> None:
     """A smooth force that is as good as a jump to long steps."""
     print("\ntanh(v/0.001): error/tol")
     module = built(STEEP, root)
-    end = module.simulate(tol=1e-14, h_most=1e-3).q[-1, 0]
+    end = module.simulate(tol=1e-14, max_step=1e-3).q[-1, 0]
     for tol in TOLERANCES:
         print(f"{tol:.0e} {abs(module.simulate(tol=tol).q[-1, 0] - end) / tol:.2g}")
 

@@ -156,7 +156,7 @@ class Author:
             "h": lambda: float(10 ** real.uniform(-4, -1)),
             "duration": lambda: float(real.uniform(0, 0.05)), "steps": lambda: draw.randint(0, 30),
             "every": lambda: draw.randint(1, 7), "tol": lambda: float(10 ** real.uniform(-12, -3)),
-            "h_most": lambda: float(real.uniform(0.01, 1)), "stiff": lambda: draw.random() < 0.5,
+            "max_step": lambda: float(real.uniform(0.01, 1)), "stiff": lambda: draw.random() < 0.5,
             "times": lambda: np.sort(real.uniform(0, 0.1, 4)),
             "estimate": lambda: draw.random() < 0.3,
             "method": lambda: draw.choice(self.m.methods), "threads": lambda: draw.randint(1, 3),

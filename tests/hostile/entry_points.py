@@ -226,7 +226,7 @@ class Driver:
         if a.size:
             return self._reals(f, a, rows, batch)
         if a.kind == R:
-            small = name in ("h", "tol", "h_most")
+            small = name in ("h", "tol", "max_step")
             return own, f"const {R} {own} = ({R}){'small_number()' if small else 'number()'};"
         if name == "p":
             count = "(p_instance ? count : 1)" if batch else "1"

@@ -149,7 +149,7 @@ def test_fast_path_refuses_invalid_inputs_like_general_path(
 def test_first_step_respects_maximum_step_size(kepler: ModuleType) -> None:
     """Far away and at rest nothing else limits the first step."""
     options = {"q0": [1e3, 0.0], "qd0": [0.0, 0.0], "params": {"mu": 1e-12}}
-    run = kepler.simulate(duration=100.0, h_most=0.01, **options)
+    run = kepler.simulate(duration=100.0, max_step=0.01, **options)
     assert np.diff(run.t).max() <= 0.01 * (1 + 1e-9)
     assert np.diff(kepler.simulate(duration=100.0, **options).t)[0] > 0.05
 
@@ -322,7 +322,7 @@ def test_constant_inputs_act_in_adaptive_steps(kepler: ModuleType) -> None:
 
 
 def test_steps_respect_maximum_step_size(kepler: ModuleType) -> None:
-    run = kepler.simulate(duration=PERIOD, h_most=0.05)
+    run = kepler.simulate(duration=PERIOD, max_step=0.05)
     assert np.diff(run.t).max() <= 0.05 * (1 + 1e-12) and run.steps > 120
 
 
@@ -356,14 +356,14 @@ def test_run_into_a_singularity_stops_and_reports_the_time(kepler: ModuleType) -
         ),
         ({"tol": "x"}, "tol: 'x' is not a number"),
         ({"tol": 1e-6, "h": 0.1}, "h: belongs to fixed steps"),
-        ({"tol": 1e-6, "every": 2}, "every: belongs to fixed steps; tol, h_most and stiff"),
+        ({"tol": 1e-6, "every": 2}, "every: belongs to fixed steps; tol, max_step and stiff"),
         ({"every": 2}, "eccentric goes by its tolerance, 1e-09, where nothing is said: give h too"),
         ({"tol": 1e-6, "times": [1.0, 0.5]}, "times: expected ascending times from t0"),
         ({"tol": 1e-6, "times": [-1.0]}, "times: expected ascending times from t0 = 0 s"),
         ({"tol": 1e-6, "times": []}, "times: expected a row of finite numbers"),
         ({"tol": 1e-6, "times": [1.1], "duration": 1.0}, "times: 1.1 s is behind the end of"),
         ({"tol": 1e-6, "duration": -1.0}, "duration: -1 is not a time"),
-        ({"tol": 1e-6, "h_most": 0}, "h_most: 0 is not a step size"),
+        ({"tol": 1e-6, "max_step": 0}, "max_step: 0 is not a step size"),
     ],
 )
 def test_invalid_arguments_of_adaptive_runs_are_refused(

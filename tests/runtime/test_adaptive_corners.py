@@ -64,7 +64,7 @@ def test_smoothed_friction_is_resolved_like_a_kink(width: float, modules: Module
     module = modules.unoptimised(text)
     for start in (0.7, 1.0, 1.6):
         options = {"q0": [start], "params": {"w": width}}
-        end = module.simulate(tol=1e-14, h_most=1e-3, **options).q[-1, 0]
+        end = module.simulate(tol=1e-14, max_step=1e-3, **options).q[-1, 0]
         for tol in TOLERANCES:
             assert abs(module.simulate(tol=tol, **options).q[-1, 0] - end) < 10 * tol, (start, tol)
 

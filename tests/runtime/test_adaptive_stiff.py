@@ -325,7 +325,7 @@ duration = 10
     ("options", "message"),
     [
         ({"stiff": "no"}, "stiff: 'no' is not True or False"),
-        ({"stiff": True, "h": 0.1}, "h_most and stiff to adaptive ones"),
+        ({"stiff": True, "h": 0.1}, "max_step and stiff to adaptive ones"),
     ],
 )
 def test_invalid_values_of_stiff_are_refused(

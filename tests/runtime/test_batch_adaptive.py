@@ -87,7 +87,7 @@ def test_batch_split_into_several_calls_is_identical(
 
 
 def test_maximum_step_size_holds_for_each_instance(orbits: ModuleType) -> None:
-    run = orbits.simulate_batch(*starts(9), tol=1e-4, duration=6.0, h_most=0.05)
+    run = orbits.simulate_batch(*starts(9), tol=1e-4, duration=6.0, max_step=0.05)
     assert np.all(run.steps >= 120)
     unlimited = orbits.simulate_batch(*starts(9), tol=1e-4, duration=6.0)
     assert unlimited.steps[0] < 20 and np.abs(run.q - unlimited.q).max() < 1e-2

@@ -202,7 +202,7 @@ def test_event_function_of_pure_rounding_costs_little_time() -> None:
     events = event("noise", "sin(x)**2 + cos(x)**2 - 1", 'action = "stop"')
     module = built(FREE.format(name="noisy", events=events))
     start = time.perf_counter()
-    assert module.simulate(duration=20.0, h_most=0.1).steps < 2000
+    assert module.simulate(duration=20.0, max_step=0.1).steps < 2000
     assert time.perf_counter() - start < 1.0
 
 

@@ -141,7 +141,7 @@ def test_stopped_run_has_an_error_and_jumping_run_a_balance(ball: ModuleType) ->
 
 def test_arguments_of_fixed_and_adaptive_steps_exclude_each_other(ball: ModuleType) -> None:
     with pytest.raises(ValueError, match="h: belongs to fixed steps"):
-        ball.simulate(h=0.01, h_most=0.1)
+        ball.simulate(h=0.01, max_step=0.1)
 
 
 @pytest.mark.slow

@@ -136,7 +136,7 @@ def test_steps_are_judged_if_time_resolves_them(
     assert checks.step_limit_errors(start) == 0 and checks.step_limit_errors(late) is None
 
     def refuse_without_limit(
-        self: AdaptiveRefusalChecks, *args: Any, h_most: float = 0.0, **how: Any
+        self: AdaptiveRefusalChecks, *args: Any, max_step: float = 0.0, **how: Any
     ) -> Any:
         return drive(self, *args, **how)
 

@@ -448,7 +448,7 @@ class AdaptiveFunctions:
 
         The function chooses the step size by the error tolerance.
         """
-        arguments = (*map(self.number, ("t_end", "tol", "h_most")), *self.constant_arguments)
+        arguments = (*map(self.number, ("t_end", "tol", "max_step")), *self.constant_arguments)
         status = self.functions.status
         return c.static_prototype(
             f"{self.method}_adaptive_step", status, self.state, *arguments, self.workspace
@@ -483,7 +483,7 @@ class AdaptiveFunctions:
 
         Only scenes with events use it.
         """
-        limits, status = map(self.number, ("t_end", "h_most")), self.functions.status
+        limits, status = map(self.number, ("t_end", "max_step")), self.functions.status
         return c.static_prototype(
             f"{self.method}_fixed",
             status,
@@ -678,7 +678,7 @@ def run_view(
         max_events=max_events_per_step(target.system),
         retry_after=RETRY_AFTER,
         run=functions.public.adaptive(METHOD.name),
-        advance=stepping.step.call(x="&x", **({"h_most": "longest"} if happen else {})),
+        advance=stepping.step.call(x="&x", **({"max_step": "longest"} if happen else {})),
         fixed=stepping.fixed.call(x="&x") if happen else "",
         happen=happen,
         restart=restart,

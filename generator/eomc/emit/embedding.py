@@ -153,7 +153,7 @@ def main_view(target: Target) -> MainView:
             t0="0", first="n", steps="next", u="NULL", u_stride="0", every="0", **rows
         )
     else:
-        method, limits = f"{adaptive.METHOD.name}_adaptive", {"t_end": "next", "h_most": "0"}
+        method, limits = f"{adaptive.METHOD.name}_adaptive", {"t_end": "next", "max_step": "0"}
         run = public.adaptive(adaptive.METHOD.name).call(
             t="&t", **limits, u="NULL", steps="1000000", times="NULL", count="0", t_rows="NULL",
             room="0", events="NULL", which="NULL", event_rows="NULL", **rows,

@@ -204,7 +204,7 @@ def takes_t(target: Target, name: str) -> bool:
 
 
 STATE = ("q", "qd")
-LIMITS = ("t_end", "tol", "h_most")  # of adaptive steps
+LIMITS = ("t_end", "tol", "max_step")  # of adaptive steps
 
 
 @dataclass(frozen=True)

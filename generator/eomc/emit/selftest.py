@@ -828,7 +828,7 @@ class _Cases:
         """Return the C call of an adaptive run from the time t of the test state to t + span."""
         return self.call(
             self.public.adaptive(adaptive.METHOD.name), q="out", qd="out + NQ", t="&t",
-            t_end=f"t + {member('s', 'span')}", h_most="0",
+            t_end=f"t + {member('s', 'span')}", max_step="0",
             tol=self.target.literal(1e-12 if self.double else 1e-6), steps="1000", times="NULL",
             count="0", t_rows="NULL", q_rows="NULL", qd_rows="NULL",
             room=f"{self.target.PREFIX}_NE_ROOM", events="&events", which="which",

@@ -91,7 +91,7 @@ class AdaptiveRun(Run):
     _times: Array = field(kw_only=True)
     _t_end: float = field(kw_only=True)
     # rarely used fields are set after construction, whose time dominates that of short runs
-    h_most: float = field(default=0.0, init=False)
+    max_step: float = field(default=0.0, init=False)
     fixed_method: str = field(default="", init=False)  # the method of fixed steps
     last_state: tuple[float, Array] = field(
         default=(0.0, _NONE[1]), init=False
@@ -184,7 +184,7 @@ class AdaptiveRun(Run):
         """Return the arrays and numbers that a file of the run contains, by name."""
         own = {
             "tol": self.tol, "rejected": self.rejected, "stiff_steps": self.stiff_steps,
-            "times": self.t, "h_most": self.h_most, "stiff": self.stiff,
+            "times": self.t, "h_most": self.max_step, "stiff": self.stiff,
             "begin": self.initial_state,
             "t_end": self._t_end, "which": self.event_data[0],
             "event_rows": self.event_data[1], "stopped": self.stopped, "limit": self.limit,
@@ -205,7 +205,7 @@ class AdaptiveRun(Run):
             stiff_steps=arrays.get("stiff_steps", 0), _times=arrays["times"],
             _t_end=arrays["t_end"],
         )  # fmt: skip
-        run.h_most, run.stiff = arrays["h_most"], bool(arrays.get("stiff", False))
+        run.max_step, run.stiff = arrays["h_most"], bool(arrays.get("stiff", False))
         run.fixed_method = arrays.get("by", "")
         run.initial_state, run.event_data = arrays["begin"], (arrays["which"], arrays["event_rows"])
         run.stopped, run.limit = arrays["stopped"], arrays["limit"]
@@ -261,7 +261,7 @@ class AdaptiveRun(Run):
         if inputs is not None:
             u = ZeroOrderHold(inputs, self._period, self._periods)
         request = AdaptiveRequest(
-            q, qd, self.t0, end, self.tol, times, u, self.parameter_values, self.h_most,
+            q, qd, self.t0, end, self.tol, times, u, self.parameter_values, self.max_step,
             self.stiff, self.fixed_method,
         )  # fmt: skip
         return run(self.model, request)
@@ -462,7 +462,7 @@ def run(model: CompiledModel, request: AdaptiveRequest) -> AdaptiveRun:
 
     The run is returned even if it failed; its attribute `status` is then the reason.
     """
-    q, qd, t0, t_end, tol, times, u, p, h_most, stiff, method, max_steps, progress = request
+    q, qd, t0, t_end, tol, times, u, p, max_step, stiff, method, max_steps, progress = request
     (address, real, _), nq = model.c.tools, model.info.nq
     work = model.c.ffi.new("adaptive_work *")
     if stiff:
@@ -483,7 +483,7 @@ def run(model: CompiledModel, request: AdaptiveRequest) -> AdaptiveRun:
             call_start = perf_counter()
             most, *to = rows.c_arguments(room, rows_per_step)
             code = call(
-                *place, acting.stop, tol, h_most, acting.address, most, *to,
+                *place, acting.stop, tol, max_step, acting.address, most, *to,
                 *(events.room() if events else ()), at_p, work,
             )  # fmt: skip
             counters.add(work, bool(events))
@@ -526,7 +526,7 @@ def _completed_run(
     model.integrator.room = 0 if is_unusual else steps + _FIRST_CALL_STEPS
     h, evaluations = request.t_end - t0, work.evaluations
     if method:
-        h, evaluations = request.h_most, info.count_evaluations(method, steps, evaluations)
+        h, evaluations = request.max_step, info.count_evaluations(method, steps, evaluations)
     elif steps:
         h = (work.t - t0) / steps
     trajectory = AdaptiveRun(
@@ -534,7 +534,7 @@ def _completed_run(
         evaluations, tol=request.tol, rejected=work.rejected, stiff_steps=work.stiff_steps,
         _times=stamps, _t_end=request.t_end,
     )  # fmt: skip
-    trajectory.h_most, trajectory.stiff = request.h_most, bool(request.stiff)
+    trajectory.max_step, trajectory.stiff = request.max_step, bool(request.stiff)
     trajectory.fixed_method = method
     if request.times is not None:
         trajectory.initial_state = np.array([request.q, request.qd])

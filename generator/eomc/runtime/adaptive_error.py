@@ -89,7 +89,7 @@ def error_by_tighter_tolerance(
         """
         # the perturbed motion may differ, so its steps are limited
         most = _MAX_STEP_RATIO * (own.steps + own.rejected) + _MAX_STEP_RATIO**2
-        return again.states(tol, begin + nudge, own.h_most, most) - base
+        return again.states(tol, begin + nudge, own.max_step, most) - base
 
     differences = [moved(moves * size * scale * signs)]
     rows = _filled(np.abs(again.at_rows(differences[0]))) / size
@@ -104,7 +104,7 @@ def error_by_tighter_tolerance(
         full = np.maximum.accumulate(np.max(rows / scale, axis=1) * size > _SATURATED_DIFFERENCE)
         if full.any():  # the first perturbation is too large for a linear estimate
             little = moves * _PERTURBATION_ROUNDINGS * eps * scale * signs
-            nearest = again.states(least, begin, own.h_most)
+            nearest = again.states(least, begin, own.max_step)
             differences.append(moved(little, least, nearest))
             near = _filled(np.abs(again.at_rows(differences[1]))) / (_PERTURBATION_ROUNDINGS * eps)
             rows = np.where(full[:, None], np.maximum(rows, near), rows)
@@ -155,12 +155,12 @@ class _Rerun:
         self.reached = float(own.events[own.stopped].t[-1] if own.stopped else own.t[-1])
 
     def __call__(
-        self, tol: float, start: Array, h_most: float, steps: float = np.inf,
+        self, tol: float, start: Array, max_step: float, steps: float = np.inf,
         end: float | None = None,
     ) -> tuple[Array, Any]:  # fmt: skip
         """Repeat the run; return the new states at the rows of the original run, and the new run.
 
-        tol: tolerance. start: initial state [q; qd]. h_most: longest step, s, or size of fixed
+        tol: tolerance. start: initial state [q; qd]. max_step: longest step, s, or size of fixed
         steps. steps: number of steps after which the run ends early. end: end time, s; None: that
         of the original run. The states have the shape (n, 2 nq) and are nan where the new run has
         no row. A row at a jump gets the state of the last row before that is not at a jump.
@@ -171,18 +171,18 @@ class _Rerun:
         if not len(self.kept):
             return out[self.beside], None
         to = float(own.t[-1]) if end is None else end
-        rerun = self.rerun(tol, start, h_most, steps, to, own.t[self.kept])
+        rerun = self.rerun(tol, start, max_step, steps, to, own.t[self.kept])
         out[self.kept[: len(rerun)]] = rerun.x
         self._end(out, rerun)
         return out[self.beside], rerun
 
     def rerun(
-        self, tol: float, start: Array, h_most: float, steps: float, end: float, times: Array
+        self, tol: float, start: Array, max_step: float, steps: float, end: float, times: Array
     ) -> Any:
         own, nq = self.own, self.own.model.info.nq
         request = AdaptiveRequest(
             start[:nq], start[nq:], own.t0, end, tol, times.astype(own.model.info.dtype), self.u,
-            own.parameter_values, h_most, own.stiff, own.fixed_method, steps, self.progress,
+            own.parameter_values, max_step, own.stiff, own.fixed_method, steps, self.progress,
         )  # fmt: skip
         rerun = self.run(own.model, request)
         if rerun.status == "interrupted":
@@ -214,10 +214,10 @@ class _Rerun:
             return np.concatenate(self.own(self.times), axis=1).astype(float)
         return np.concatenate([np.ravel(self.own.initial_state)[None], self.x[self.kept]])
 
-    def states(self, tol: float, start: Array, h_most: float, steps: float = np.inf) -> Array:
+    def states(self, tol: float, start: Array, max_step: float, steps: float = np.inf) -> Array:
         """Repeat the run from another start and return its states [q; qd] at `times`, (m, 2 nq).
 
-        tol: tolerance. start: initial state [q; qd]. h_most: longest step, s, or size of fixed
+        tol: tolerance. start: initial state [q; qd]. max_step: longest step, s, or size of fixed
         steps.
         steps: number of steps after which the new run ends early. States after an early end are
         nan.
@@ -226,7 +226,7 @@ class _Rerun:
         out = np.full((len(times), self.x.shape[1]), np.nan)
         out[0] = start
         if len(times) > 1:
-            rerun = self.rerun(tol, start, h_most, steps, float(own.t[-1]), times[1:])
+            rerun = self.rerun(tol, start, max_step, steps, float(own.t[-1]), times[1:])
             out[1 : 1 + len(rerun)] = rerun.x
             self._end(out, rerun)
         return out
@@ -257,7 +257,7 @@ class _Rerun:
         rows, rerun = self(tol, begin, shorter, end=end)
         if own.status == "ok" and rerun is not None and rerun.status not in COMPLETE_STATUSES:
             # this run had too short steps near singular positions
-            rows, rerun = self(tol, begin, own.h / 2 if own.fixed_method else own.h_most, end=end)
+            rows, rerun = self(tol, begin, own.h / 2 if own.fixed_method else own.max_step, end=end)
         return rows, rerun
 
 
@@ -349,7 +349,7 @@ class _Events:
         """
         finer, remedy = "shorter steps", "a smaller h"
         if not own.fixed_method:
-            finer, remedy = "a tighter tolerance", "a tighter tolerance, or a shorter h_most"
+            finer, remedy = "a tighter tolerance", "a tighter tolerance, or a shorter max_step"
         messages = []
         if self.missed:
             messages.append(
@@ -396,7 +396,7 @@ def _finer(own: Any, least: float) -> tuple[float, float]:
     if own.fixed_method:
         return own.tol, own.h / 4
     tol = max(own.tol / _TOLERANCE_RATIO, least) if own.tol >= 2 * least else 4 * least
-    longest = (own.h / 2, float(np.ptp(own.t)) / _MIN_REFERENCE_STEPS, own.h_most)
+    longest = (own.h / 2, float(np.ptp(own.t)) / _MIN_REFERENCE_STEPS, own.max_step)
     return tol, min((h for h in longest if h > 0), default=0.0)
 
 

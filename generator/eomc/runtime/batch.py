@@ -74,7 +74,7 @@ class Batch(Component):
         params: Any = None, u: ArrayLike | None = None, threads: int | None = None,
         method: str | None = None, *, t0: float = 0.0, control_period: float | None = None,
         progress: Callable[[int, int], None] | None = None, tol: float | None = None,
-        times: ArrayLike | None = None, h_most: float | None = None, stiff: bool = False,
+        times: ArrayLike | None = None, max_step: float | None = None, stiff: bool = False,
         max_evaluations: int | None = None, events: Mapping[str, Any] | None = None,
         **unknown: Never,
     ) -> BatchRun:  # fmt: skip
@@ -120,7 +120,7 @@ class Batch(Component):
         times : (n,) array, optional
             Ascending times of the rows, s, within the duration. By default adaptive steps have rows
             at the start and at the end only.
-        h_most : float, optional
+        max_step : float, optional
             Longest adaptive step, s.
         stiff : bool
             Begin adaptive steps with Newton's method.
@@ -147,7 +147,7 @@ class Batch(Component):
             return cast(BatchRun, other.batch.simulate_batch(**arguments))
         options = SimulationArguments(
             q0, qd0, h, duration, steps, every, u, params, method, t0, control_period, None,
-            as_progress(progress), tol, times, h_most, stiff, threads, max_evaluations,
+            as_progress(progress), tol, times, max_step, stiff, threads, max_evaluations,
         )  # fmt: skip
         if options.uses_adaptive_steps(self.info):
             return self._finish(*batch_adaptive.simulate(self.model, options))

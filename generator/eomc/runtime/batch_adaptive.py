@@ -39,7 +39,7 @@ _FIRST_CHUNK_STEPS = 64  # steps of an instance before the first check of Ctrl-C
 _SAVED_FIELDS = {  # fields by the names that they have in files
     "tol": "tol", "evaluations": "evaluations", "rejected": "rejected",
     "stiff_steps": "stiff_steps", "reached": "reached", "_times": "_times",
-    "_begin": "initial_state", "_h_most": "h_most", "_stiff": "stiff", "_period": "_period",
+    "_begin": "initial_state", "_h_most": "max_step", "_stiff": "stiff", "_period": "_period",
     "_by": "fixed_method", "_max_evaluations": "_max_evaluations",
 }  # fmt: skip
 _EVENT_FIELDS = ("event_instances", "which", "event_rows")  # of a saved run
@@ -74,7 +74,7 @@ class AdaptiveBatchRun(BatchRun):
     reached: Array = field(kw_only=True)
     _times: Array = field(kw_only=True)
     initial_state: Array = field(kw_only=True)  # q and qd at t0, (2, batch, nq)
-    h_most: float = field(kw_only=True)
+    max_step: float = field(kw_only=True)
     stiff: bool = field(kw_only=True)
     _period: float = field(default=0.0, kw_only=True)  # control period, s; 0 without one
     fixed_method: str = field(default="", kw_only=True)  # the method of fixed steps
@@ -118,12 +118,12 @@ class AdaptiveBatchRun(BatchRun):
             limit += each * (len(times) + len(self.t))
         # the end may be later than the last of the times
         plan = _Plan(
-            self.t0, self.tol, times.astype(self.model.info.dtype), self.h_most, self.stiff,
+            self.t0, self.tol, times.astype(self.model.info.dtype), self.max_step, self.stiff,
             self._period, self.fixed_method, limit,
         )  # fmt: skip
         instances = Instances(None, self.parameter_values, inputs, initial_failures(self))
         work = _Work(self.model, self.initial_state.copy(), plan, instances)
-        work.limits = float(self._times[-1]), self.tol, self.h_most
+        work.limits = float(self._times[-1]), self.tol, self.max_step
         if len(times) and not work.run(None, None):
             raise KeyboardInterrupt
         work.rows[:, self._late(times)] = np.nan
@@ -205,7 +205,7 @@ class AdaptiveBatchRun(BatchRun):
 class _Plan(NamedTuple):
     """Checked arguments of a batch that are the same for all instances.
 
-    t0: start time, s. tol: tolerance. times: times of the rows, s. h_most: longest adaptive step,
+    t0: start time, s. tol: tolerance. times: times of the rows, s. max_step: longest adaptive step,
     s, or size of fixed steps. stiff: whether to begin with Newton's method. period: control period
     of the inputs, s; 0: none. method: method of fixed steps; "": adaptive steps. max_evaluations:
     maximum of evaluations of an instance; 0: none.
@@ -214,7 +214,7 @@ class _Plan(NamedTuple):
     t0: float
     tol: float
     times: Array
-    h_most: float
+    max_step: float
     stiff: bool
     period: float
     method: str = ""
@@ -272,7 +272,7 @@ def _run(
     model: CompiledBatchModel, options: SimulationArguments, plan: _Plan
 ) -> tuple[AdaptiveBatchRun, bool]:
     """Simulate from checked arguments."""
-    u, span, method, h = options.u, plan.duration, plan.method, plan.h_most
+    u, span, method, h = options.u, plan.duration, plan.method, plan.max_step
     count = count_periods(span, plan.period) if plan.period else None
     if count is not None and options.duration is not None:
         u = cut_table(u, model.info.nu, count_periods(options.duration, plan.period), count, 1)
@@ -307,7 +307,7 @@ def _run(
         inputs.copy() if inputs is not None and over else None,
         tol=plan.tol, evaluations=evaluations, rejected=counts["rejected"],
         stiff_steps=counts["stiff_steps"], reached=work.t, _times=plan.times, initial_state=begin,
-        h_most=h, stiff=bool(plan.stiff), _period=plan.period, fixed_method=method,
+        max_step=h, stiff=bool(plan.stiff), _period=plan.period, fixed_method=method,
         _max_evaluations=plan.max_evaluations,
     )  # fmt: skip
     if work.events:
@@ -341,7 +341,7 @@ class _Work:
         self.model, (self.q, self.qd), self.times = model, begin, plan.times
         self.inputs, self.table, self.period = instances.inputs, instances.parameters, plan.period
         # end time, tolerance and longest step
-        self.limits = float(plan.times[-1]), plan.tol, plan.h_most
+        self.limits = float(plan.times[-1]), plan.tol, plan.max_step
         (count, nq), n = self.q.shape, len(plan.times)
         self.t0, self.t = plan.t0, np.full(count, plan.t0, model.info.dtype)
         self.rows = np.empty((2, count, n, nq), model.info.dtype)

@@ -249,12 +249,12 @@ class Integrator(Component):
         u: Inputs = None, params: Parameters = None, method: str | None = None, *, t0: float = 0.0,
         control_period: float | None = None, out: tuple[Array, Array] | None = None,
         progress: Callable[[int, int], None] | None = None, estimate: bool = False,
-        tol: float | None = None, times: ArrayLike | None = None, h_most: float | None = None,
+        tol: float | None = None, times: ArrayLike | None = None, max_step: float | None = None,
         stiff: bool = False, events: Mapping[str, Any] | None = None, **unknown: Never,
     ) -> Run:  # fmt: skip
         """Simulate the motion by fixed steps of size h or by adaptive steps, and return the run.
 
-        Steps are adaptive if `tol`, `h_most`, `stiff` or method="auto" is given, or if the scene
+        Steps are adaptive if `tol`, `max_step`, `stiff` or method="auto" is given, or if the scene
         has a tolerance and none of `h`, `steps` and `method` is given. A run that cannot go on ends
         with its last valid state, and a warning is issued.
 
@@ -293,7 +293,7 @@ class Integrator(Component):
             Tolerance of adaptive steps: error of a step relative to the distance that it moves.
         times : (n,) array_like, optional
             Ascending output times from t0 on, s, of the rows; within `duration` if that is given.
-        h_most : float, optional
+        max_step : float, optional
             Largest adaptive step, s.
         stiff : bool
             Begin adaptive steps with Newton's method, for stiff motion.
@@ -327,7 +327,7 @@ class Integrator(Component):
                      and times is None and type(t0) is float and isfinite(t0))  # fmt: skip
         if (
             is_simple and (room := self.room) and h is None and steps is None and method is None
-            and h_most is None and every == 1 and stiff is False
+            and max_step is None and every == 1 and stiff is False
             and (
                 short := adaptive.simulate_short_run(
                     self.model, (q0, qd0), duration, u, params, t0, tol, room
@@ -337,13 +337,13 @@ class Integrator(Component):
             return short
         estimate, progress = as_flag(estimate, "estimate"), as_progress(progress)
         q0, qd0 = self.model.constraints.assemble(q0, qd0, t0, params)
-        if is_simple and u is duration is tol is h_most is None and stiff is False:
+        if is_simple and u is duration is tol is max_step is None and stiff is False:
             run = self._short_run((q0, qd0), h, steps, every, params, method, t0)
             if run is not None:
                 return run
         options = SimulationArguments(
             q0, qd0, h, duration, steps, every, u, params, method, t0, control_period, out,
-            progress, tol, times, h_most, stiff,
+            progress, tol, times, max_step, stiff,
         )  # fmt: skip
         if options.uses_adaptive_steps(self.info):
             return self._finish(adaptive.simulate(self.model, options), estimate)

@@ -255,9 +255,9 @@ def initial_value_message(model: Any, name: str) -> str:
 # common names of other packages for the arguments of a run
 _CALLED = {
     "dt": "h", "step": "h", "step_size": "h", "stepsize": "h", "timestep": "h", "rtol": "tol",
-    "atol": "tol", "eps": "tol", "max_step": "h_most", "t_eval": "times", "tmax": "duration",
-    "t": "duration", "t_end": "duration", "t_final": "duration", "t_span": "duration",
-    "x0": "q0", "v0": "qd0",
+    "atol": "tol", "eps": "tol", "h_most": "max_step", "h_max": "max_step", "t_eval": "times",
+    "tmax": "duration", "t": "duration", "t_end": "duration", "t_final": "duration",
+    "t_span": "duration", "x0": "q0", "v0": "qd0",
 }  # fmt: skip
 
 

@@ -56,7 +56,7 @@ class SimulationArguments(NamedTuple):
     progress: Progress = None
     tol: float | None = None
     times: ArrayLike | None = None
-    h_most: float | None = None
+    max_step: float | None = None
     stiff: bool = False
     threads: int | None = None
     max_evaluations: int | None = None
@@ -64,10 +64,10 @@ class SimulationArguments(NamedTuple):
     def uses_adaptive_steps(self, info: SceneInfo) -> bool:
         """Return True if these arguments ask for adaptive steps.
 
-        Steps are adaptive if tol, h_most, stiff or method="auto" is given. They are also adaptive
+        Steps are adaptive if tol, max_step, stiff or method="auto" is given. They are also adaptive
         if the scene has a tolerance and none of h, steps and method is given.
         """
-        if self.tol is None and self.h_most is None and self.stiff is False:
+        if self.tol is None and self.max_step is None and self.stiff is False:
             if self.method is None:
                 return bool(info.tolerance) and self.h is None and self.steps is None
             return self.method == "auto"
@@ -82,7 +82,7 @@ class SimulationArguments(NamedTuple):
         as_flag(self.stiff, "stiff")
         if info.tolerance is None:
             raise ValueError(
-                f"tol: {info.name} was built without adaptive steps, to which tol, h_most and "
+                f"tol: {info.name} was built without adaptive steps, to which tol, max_step and "
                 f"stiff belong: build it with {option('tolerance', '1e-9')}"
             )
         fixed = (
@@ -93,14 +93,14 @@ class SimulationArguments(NamedTuple):
         for name, is_present in fixed:
             if is_present:
                 raise ValueError(f"{name}: {self._why_not_adaptive(info)}")
-        most = 0.0 if self.h_most is None else as_step_size(self.h_most, info.dtype, "h_most")
+        most = 0.0 if self.max_step is None else as_step_size(self.max_step, info.dtype, "max_step")
         return as_tolerance(info.tolerance if self.tol is None else self.tol, info.dtype), most
 
     def _why_not_adaptive(self, info: SceneInfo) -> str:
         """Return the reason why adaptive steps do not accept an argument of fixed steps."""
-        if self.tol is not None or self.h_most is not None or self.stiff or self.method == "auto":
+        if self.tol is not None or self.max_step is not None or self.stiff or self.method == "auto":
             return (
-                "belongs to fixed steps; tol, h_most and stiff to adaptive ones: give one or the "
+                "belongs to fixed steps; tol, max_step and stiff to adaptive ones: give one or the "
                 "other"
             )
         return (
@@ -240,12 +240,12 @@ class AdaptiveRequest(NamedTuple):
         Constant inputs, inputs that are held over control periods, or the scene's signals (None).
     p : (np,) array
         Parameters.
-    h_most : float
+    max_step : float
         Longest adaptive step, s (0: no limit), or the size of fixed steps.
     stiff : bool
         Whether the run begins with Newton's method.
     method : str
-        Name of the method of fixed steps of size h_most; "": adaptive steps.
+        Name of the method of fixed steps of size max_step; "": adaptive steps.
     max_steps : float
         Number of steps after which the run ends early. It is checked between calls of C, so the
         run may have more steps.
@@ -261,7 +261,7 @@ class AdaptiveRequest(NamedTuple):
     times: Array | None
     u: Any
     p: Array
-    h_most: float
+    max_step: float
     stiff: bool = False
     method: str = ""
     max_steps: float = inf

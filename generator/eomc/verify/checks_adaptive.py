@@ -215,12 +215,12 @@ class AdaptiveRefusalChecks:
         self.state = check.few(2)[-1].state
 
     def drive(
-        self, s: State, span: float, tol: float, h_most: float = 0.0, stiff: bool = False,
+        self, s: State, span: float, tol: float, max_step: float = 0.0, stiff: bool = False,
         each: int = MAX_STEPS,
     ) -> AdaptiveRunResult:  # fmt: skip
         """Return an adaptive run of `span` seconds by the C function, of at most MAX_STEPS steps.
 
-        s: initial state. tol: tolerance. h_most: limit of the step size, s; 0 for none. stiff:
+        s: initial state. tol: tolerance. max_step: limit of the step size, s; 0 for none. stiff:
         whether to begin with Newton's method. each: number of steps per call of the C function.
         """
         model, many = self.model, 2 * MAX_STEPS
@@ -238,8 +238,8 @@ class AdaptiveRefusalChecks:
             if status != OK or t[0] >= end or (model.info.events and work.stopped):
                 break
             status = model.c.lib.adaptive(
-                model.c.pointer(x), model.c.pointer(t), end, tol, h_most, model.c.pointer(u), each,
-                null, many - n, model.c.pointer(times[n:]), model.c.pointer(rows[0, n:]),
+                model.c.pointer(x), model.c.pointer(t), end, tol, max_step, model.c.pointer(u),
+                each, null, many - n, model.c.pointer(times[n:]), model.c.pointer(rows[0, n:]),
                 model.c.pointer(rows[1, n:]), *events, model.c.pointer(p), work,
             )  # fmt: skip
             n += work.rows
@@ -299,7 +299,7 @@ class AdaptiveRefusalChecks:
         if not resolves_steps(self.check, s, span / parts):
             return None
         run, cut = (
-            self.drive(s, span, COARSE_TOLERANCE, h_most=span / parts, each=n)
+            self.drive(s, span, COARSE_TOLERANCE, max_step=span / parts, each=n)
             for n in (MAX_STEPS, 1)
         )
         sizes = np.diff(np.concatenate([[s.t], run.times]))

@@ -260,7 +260,7 @@ def scene_header(target: Target, token: str) -> SceneHeaderView:
         ),
         step="" if by_tolerance else public.step(method).call(),
         adaptive=public.adaptive(adaptive.METHOD.name).call(
-            h_most="0", steps=str(STEPS), times="NULL", count="0", t_rows="NULL", q_rows="NULL",
+            max_step="0", steps=str(STEPS), times="NULL", count="0", t_rows="NULL", q_rows="NULL",
             qd_rows="NULL", room="unitRoom", status="&status",
         ) if by_tolerance else "",
         start_lines=start_lines,
