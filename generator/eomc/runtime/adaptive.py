@@ -16,9 +16,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .adaptive_error import error_by_tighter_tolerance
 from .arguments import Array, ByName, as_number, as_step_size, check_time, machine_memory
-from .balance import with_jumps
 from .c_library import next_chunk
 from .estimate import Estimate
 from .events import EventBuffer, EventLog
@@ -32,7 +30,6 @@ from .inputs import (
 from .interfaces import CompiledModel
 from .package import is_built_from_system, option
 from .requests import AdaptiveRequest, SimulationArguments, as_end, as_times, as_tolerance
-from .section import crossings
 from .stability import MIN_STEPS, LinearizationState
 from .status import FULL, PART, STATUS, STATUS_MESSAGES, state_text
 from .trajectory import Run
@@ -275,6 +272,8 @@ class AdaptiveRun(Run):
 
     def resample(self, count: int) -> AdaptiveRun:
         """Interpolate the run at `count` equidistant times, with both rows of each jump."""
+        from .balance import with_jumps
+
         steps: AdaptiveRun = with_jumps(self)
         jumps = np.flatnonzero(np.diff(steps.t) == 0)
         own = np.unique(np.concatenate([[0], jumps, jumps + 1, [len(steps) - 1]]))
@@ -295,6 +294,9 @@ class AdaptiveRun(Run):
     def _crossings(
         self, name: str, value: float, rising: bool | None, period: float | None
     ) -> dict[str, Array]:
+        from .balance import with_jumps
+        from .section import crossings
+
         steps: AdaptiveRun = with_jumps(self)
         t, parts = steps.t[:, None], np.arange(1, _ROWS_PER_STEP) / _ROWS_PER_STEP
         between = (t[:-1] + np.diff(t, axis=0) * parts).astype(t.dtype)
@@ -329,6 +331,8 @@ class AdaptiveRun(Run):
         return self.with_rows(times, np.array(self(times)))
 
     def _estimated(self, progress: Callable[[int, int], None] | None) -> Estimate:
+        from .adaptive_error import error_by_tighter_tolerance
+
         return error_by_tighter_tolerance(self, run, progress)
 
 

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arguments import Array, ByName, not_one_of
+from .arguments import Array, ByName
 from .atomic_write import File
 from .batch_work import BatchStepper, BatchSteps, Instances
 from .columns import Columns
 from .interfaces import CompiledBatchModel
-from .labels import mathtext, with_unit
 from .package import own_model, reduced, require_eomc
-from .plot import Curve, Source, against, check_axes, finished, new_axes, no_files
 from .status import STATUS, STATUS_MESSAGES
 from .trajectory_data import parts, within
 
@@ -322,7 +320,10 @@ class BatchRun(Columns):
         """
         for name in _SINGLE_RUN_ARGUMENTS & style.keys():
             raise TypeError(f"plot: {name}= {single_run_hint(self)}.plot({name}=...)")
-        return _draw(self, names, _FanOptions(quantiles, lines, over, wrap, ax, axes, file, style))
+        from .plot import FanOptions, draw_fan
+
+        options = FanOptions(quantiles, lines, over, wrap, ax, axes, file, style)
+        return draw_fan(self, names, options)
 
     def animate(
         self, file: File | None = None, *, names: Sequence[str] = (),
@@ -485,87 +486,3 @@ def _rows(x: Array) -> Array:
 def _by_name(what: str, names: Sequence[str], rows: Callable[[], Array]) -> ByName:
     """Return the values of `rows`, (batch, n, names, ...), by name."""
     return ByName(what, names, np.ascontiguousarray(np.moveaxis(rows(), 2, 0)) if names else ())
-
-
-class _FanOptions(NamedTuple):
-    """Arguments of `BatchRun.plot` besides the names of columns."""
-
-    quantiles: Sequence[float]
-    lines: int | None
-    over: Any
-    wrap: bool | str | Sequence[str]
-    ax: Any
-    axes: Any
-    file: File | None
-    style: dict[str, Any]
-
-
-def _draw(run: BatchRun, names: Sequence[str], options: _FanOptions) -> Any:
-    """Draw the distribution of a batch over time with matplotlib and return the Axes."""
-    quantiles, lines, over, wrap, ax, axes, file, style = options
-    no_files(names)
-    source = Source(run, wrap)
-    curves = [source.curve(name) for name in ([*names] or source.coordinates)]
-    if ax is None and axes is None:
-        panels = new_axes(len(curves))
-    else:
-        panels = check_axes(ax, axes, len(curves))
-    for place, curve in zip(panels, curves, strict=True):
-        if over is not None:
-            _ends(place, curve, *_over(run, over), style)
-        elif lines is not None:
-            for k in np.unique(np.linspace(0, len(run) - 1, min(lines, len(run))).astype(int)):
-                each = replace(curve, values=curve.values[k])
-                against(place, source.t, [each], **{"linewidth": 0.6, "color": "C0", **style})
-        else:
-            _bands(place, source.t, curve, sorted(quantiles), style)
-        if over is None:
-            place.set_ylabel(with_unit(curve.text, curve.unit))
-    if over is None:
-        panels[-1].set_xlabel(with_unit(mathtext("t"), "s"))
-    return finished(panels, file)
-
-
-def _bands(axes: Any, t: Array, curve: Curve, quantiles: Sequence[float], style: Any) -> None:
-    """Fill between pairs of quantiles and draw the median."""
-    has_values = ~np.isnan(curve.values).all(axis=0)  # rows with values of some instance
-    t, values = t[has_values], curve.values[:, has_values]
-    bands = np.nanquantile(values, quantiles, axis=0)
-    colour = style.get("color", "C0")
-    pairs = len(quantiles) // 2
-    for k in range(pairs):
-        low, high = quantiles[k], quantiles[-1 - k]
-        axes.fill_between(
-            t, bands[k], bands[-1 - k], color=colour, alpha=0.15 + 0.35 * (k + 1) / (pairs + 1),
-            linewidth=0, label=f"{100 * low:g} to {100 * high:g} %",
-        )  # fmt: skip
-    if len(quantiles) % 2:
-        axes.plot(t, bands[pairs], **{"color": colour, "label": "median", **style})
-    axes.legend()
-
-
-def _over(run: Any, over: Any) -> tuple[str, Array]:
-    """Return label and values (batch,) of the axis: instance, parameter or given numbers."""
-    if isinstance(over, str) and over == "instance":
-        return "instance", np.arange(len(run), dtype=float)
-    if isinstance(over, str):
-        names = run.model.info.parameters
-        if over not in names:
-            raise ValueError(not_one_of("over", over, ("instance", *names)))
-        unit = run.model.info.units.get(over, "")
-        values = np.broadcast_to(run.parameter_values[:, names.index(over)], (len(run),))
-        return with_unit(mathtext(over), unit), values
-    values = np.asarray(over, float)
-    if values.shape != (len(run),):
-        raise ValueError(f"over: shape {values.shape}, expected ({len(run)},)")
-    return "", values
-
-
-def _ends(axes: Any, curve: Curve, label: str, x: Array, style: Any) -> None:
-    """Draw the last value of each instance over x."""
-    good = np.isfinite(curve.values)
-    last = curve.values.shape[1] - 1 - np.argmax(good[:, ::-1], axis=1)
-    y = np.where(good.any(axis=1), curve.values[np.arange(len(last)), last], np.nan)
-    axes.plot(x, y, **{"linestyle": "none", "marker": ".", **style})
-    axes.set_xlabel(label)
-    axes.set_ylabel(with_unit(f"{curve.text} at the end", curve.unit))

@@ -4,22 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .arguments import Array, ByName
 from .atomic_write import File
-from .balance import Balance, balance
 from .estimate import Estimate, estimate
 from .inputs import evaluate_law
-from .notebook import html
 from .package import require_eomc, warn
-from .plot import plot
-from .section import as_section, crossings
 from .status import STATUS_MESSAGES, Interrupted, state_text
 from .trajectory_data import Trajectory, infinite_at_start
+
+if TYPE_CHECKING:  # modules that analyse and draw runs are imported when they are used
+    from .balance import Balance
 
 NOISE = (
     "estimate: u gives other values at the start than it gave in the run, as noise does, or what "
@@ -86,6 +85,8 @@ class Run(Trajectory):
             force is not finite, or if the inputs at the rows are unknown. They are unknown for a
             function u in a run with `every` > 1.
         """
+        from .balance import balance
+
         return balance(self)
 
     def plot(
@@ -134,6 +135,8 @@ class Run(Trajectory):
         ValueError
             If the number of `axes` or `labels` does not fit.
         """
+        from .plot import plot
+
         return plot(self, names, phase, section, other, labels, wrap, ax, axes, file, style)
 
     def section(
@@ -171,11 +174,15 @@ class Run(Trajectory):
         KeyError
             If the name is unknown.
         """
+        from .section import as_section
+
         return self._crossings(name, *as_section(self._columns(), name, value, rising, period))
 
     def _crossings(
         self, name: str, value: float, rising: bool | None, period: float | None
     ) -> dict[str, Array]:
+        from .section import crossings
+
         return crossings(self.to_dict(), name, value, rising, period)
 
     @property
@@ -185,6 +192,8 @@ class Run(Trajectory):
 
     def _repr_html_(self) -> str:
         """Return the summary of the run that notebooks display, as HTML."""
+        from .notebook import html
+
         return html(self)
 
     def animate(
