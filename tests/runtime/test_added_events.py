@@ -294,6 +294,7 @@ def test_system_read_from_a_file_works_and_changed_one_is_refused(
     run = eomc.load(system, tmp_path).simulate(duration=1.0, events=EVENTS)
     assert run.events["through"].t == pytest.approx([math.pi / 6], abs=TOL)
     for changed in (system.with_parameters({"k": 5.0}), pendulum().with_parameters({"w": 1.0})):
-        m = SimpleNamespace(name=changed.name, source=changed, events=("turns",))
+        info = SimpleNamespace(name=changed.name, events=("turns",))
+        m = SimpleNamespace(info=info, source=changed)
         with pytest.raises(EomcError, match=r"was changed since .* made it: give"):
             pipeline.with_events(m, EVENTS, tmp_path)

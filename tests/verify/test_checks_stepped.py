@@ -71,7 +71,7 @@ def late(run: Any) -> None:
 
 def perturbed_row(run: Any) -> None:
     """Perturb one row."""
-    run._rows[1][len(run) // 2] += 1e-9
+    run.rows[1][len(run) // 2] += 1e-9
 
 
 def check_events(module: Any) -> Any:

@@ -374,5 +374,5 @@ def _are_permuted(one: Any, other: Any, order: Any) -> bool:
     """Whether instance k of one is instance order[k] of the other."""
     return all(
         np.array_equal(getattr(one, name), getattr(other, name)[order], equal_nan=True)
-        for name in ("q", "qd", "steps", "_codes")
+        for name in ("q", "qd", "steps", "status_codes")
     )
