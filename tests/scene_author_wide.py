@@ -229,7 +229,7 @@ class _Wide(Author):
         self.settings()
         self.add_outputs()
         self.adaptive()
-        self.wishes()
+        self.optional_functions()
         rows = ["[constraints]", *self.rows] if self.rows else []
         outputs = ["[outputs]", *self.outputs] if self.outputs else []
         return self.text([*rows, *outputs, *more, *self.arrays], above)

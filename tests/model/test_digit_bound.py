@@ -83,12 +83,12 @@ NESTED = {
 @pytest.mark.parametrize("name", NESTED)
 def test_nested_definitions_take_seconds(name: str) -> None:
     first, formula = NESTED[name]
-    assert outcome(chain(first, formula, 30), built=True) == "ok"
+    assert outcome(chain(first, formula, 30), build=True) == "ok"
 
 
 @pytest.mark.slow
 def test_powers_of_names_take_seconds() -> None:
-    assert outcome(BASE.replace('"x"', '"10**9"').replace("+ a0", "+ x**a0"), built=True) == "ok"
+    assert outcome(BASE.replace('"x"', '"10**9"').replace("+ a0", "+ x**a0"), build=True) == "ok"
 
 
 NUMBERS = {
