@@ -91,7 +91,7 @@ def unexplained(name: str, text: str, folder: Path) -> list[str]:
     # The projection at a position where the same matrix has been regular before.
     ends += (f"if (!{name}_least_change(d, D, A, residual, fixed, HOLONOMIC))\n",)
     # The projection's iteration diverges and is kept: tests/emit/test_projection.py.
-    ends += ("if (MIN_PART*part < 1)",)
+    ends += ("if (part < MIN_PART)",)
     text = source.splitlines(keepends=True)
     refused = {n + 1 for n, x in enumerate(text, 1) if any(e in x for e in ends)}
     fallback = {n for n, x in enumerate(text, 1) if x.strip() == "at[i] = on[i];"}
