@@ -208,7 +208,7 @@ def _simulate(module: Any, arguments: RunArguments, start: Mapping[str, Any]) ->
                     every=arguments.every, progress=progress,
                 )  # fmt: skip
             seconds = time.perf_counter() - started_at
-    except module.Interrupted as stop:  # what was done is kept
+    except module.Interrupted as stop:  # the rows so far are written
         run, seconds = stop.run, time.perf_counter() - started_at
     except (ValueError, MemoryError, module.MotionError) as fault:
         raise EomcError(str(fault).replace("every=", "--every")) from None

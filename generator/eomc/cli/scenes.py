@@ -161,7 +161,7 @@ def import_command(arguments: ImportArguments) -> None:
 
 
 def _read_robot(arguments: ImportArguments) -> Robot:
-    """Read the robot file, and give the robot the name that is asked for."""
+    """Read the robot file, and give the robot the requested name."""
     from eomc.base import names
     from eomc.robots import urdf, xml
     from eomc.robots.mjcf import read

@@ -130,7 +130,7 @@ def linearization(functions: SceneFunctions) -> LinearizationView | None:
         return None
     NQ, inputs = functions.NQ, bool(target.system.inputs)
     width = f"2*{NQ} + {functions.NU}" if inputs else f"2*{NQ}"
-    cost, doc = cost_sentence(function), "[da/dq, da/dqd, da/du] at held inputs, by rows."
+    cost, doc = cost_sentence(function), "[da/dq, da/dqd, da/du] at constant inputs, by rows."
     if "linearization" in target.program:
         slopes = functions.static(function, "slopes", "slopes", doc, fails=True)
     else:

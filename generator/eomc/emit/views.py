@@ -1,7 +1,7 @@
 """What the data of all templates share: C names, and comments that state origin and units.
 
 A *view* is the data of one template: a frozen dataclass whose class attribute TEMPLATE names the
-template. Views stand beside the functions that fill them.
+template. Views are defined next to the functions that fill them.
 """
 
 from __future__ import annotations

@@ -72,6 +72,6 @@ def html_name(name: str, rate: bool = False) -> str:
     if digits := re.fullmatch(r"([A-Za-z]+?)(\d+)", head):
         head, rest = digits[1], [digits[2], *rest]
     symbol, *below = (_LETTERS.get(part, part) for part in (head, *rest))
-    if rate:  # behind a word, not on a letter of it
+    if rate:  # after the word: a dot would be set on one of its letters
         symbol += "\N{DOT ABOVE}" if len(symbol) > 1 else "\N{COMBINING DOT ABOVE}"
     return f"{symbol}<sub>{','.join(below)}</sub>" if below else symbol

@@ -13,15 +13,22 @@ from typing import Any
 import numpy as np
 
 from .arguments import Array
-from .estimate import Estimate, growth_of, mean_mass_matrix, moving_mask, rounding_words, scales
+from .estimate import (
+    SATURATED_DIFFERENCE,
+    UNRESOLVED_ERROR,
+    Estimate,
+    growth_of,
+    mean_mass_matrix,
+    moving_mask,
+    rounding_words,
+    scales,
+)
 from .inputs import ZeroOrderHold
 from .requests import MIN_TOLERANCE, AdaptiveRequest
 from .status import FULL, REMEDY
 
 GAUSS16_ORDER = 16
 COMPLETE_STATUSES = ("ok", "accumulated")  # of runs that reached the end of their motion
-_UNRESOLVED_ERROR = 0.1  # of a coordinate's scale: larger errors count as unresolved
-_SATURATED_DIFFERENCE = 0.01  # of a scale: larger differences no longer grow linearly
 _PERTURBATION_ROUNDINGS = 4.0  # perturbation of the start in roundings, if a larger one saturates
 _TAIL_DIVISOR = 40  # the final error is the largest one in the last 1/40 of the rows
 _TOLERANCE_RATIO = 100.0  # tolerance of the run over that of the reference run
@@ -99,9 +106,9 @@ def error_by_tighter_tolerance(
         left[-1] = np.abs(x[-1] - events.end)
     elif not events.stops:
         left[-1] = np.inf
-    if len(own.event_data[0]) or (left > _UNRESOLVED_ERROR * scale).any():
+    if len(own.event_data[0]) or (left > UNRESOLVED_ERROR * scale).any():
         # motion between jumps may be exact for any tolerance; then only rounding errors matter
-        full = np.maximum.accumulate(np.max(rows / scale, axis=1) * size > _SATURATED_DIFFERENCE)
+        full = np.maximum.accumulate(np.max(rows / scale, axis=1) * size > SATURATED_DIFFERENCE)
         if full.any():  # the first perturbation is too large for a linear estimate
             little = moves * _PERTURBATION_ROUNDINGS * eps * scale * signs
             nearest = again.states(least, begin, own.max_step)
@@ -299,13 +306,13 @@ class _Events:
         reached, other_end = (float(r.events[r.stopped].t[-1] if r.stopped else r.t[-1])
                          for r in (own, other))  # fmt: skip
         relative_difference = np.where(np.isfinite(left), left, 0.0) / scale
-        wrong = np.flatnonzero((left > _UNRESOLVED_ERROR * scale).any(axis=1))
+        wrong = np.flatnonzero((left > UNRESOLVED_ERROR * scale).any(axis=1))
         alike = slice(0, wrong[0] if len(wrong) else len(left))
         speed = np.max(np.abs(own.qd.astype(float)), axis=0)
         with np.errstate(divide="ignore", invalid="ignore"):
             late = np.max(left[alike, : len(speed)], axis=0, initial=0.0) / speed
         shift = _EVENT_SHIFT_FACTOR * float(np.max(late[np.isfinite(late)], initial=0.0))
-        gap = max(own.h, min(shift, _UNRESOLVED_ERROR * abs(reached - own.t0)))
+        gap = max(own.h, min(shift, UNRESOLVED_ERROR * abs(reached - own.t0)))
         # an event so near the end of one run may lie just after the end of the other
         edge = abs(reached - own.t0) * max(
             float(np.max(relative_difference[alike], initial=0.0)), _END_TOLERANCE
@@ -426,7 +433,7 @@ def _verdict(own: Any, left: Array, rounding: Array, amplification: float, event
     if own.status not in COMPLETE_STATUSES:
         words.append(f"the run stopped at t = {own.t[-1]:.6g} s")
     words += (event_messages := events.words(own))
-    is_rounding, wrong = (np.asarray((x > _UNRESOLVED_ERROR).any(axis=1)) for x in (rounding, left))
+    is_rounding, wrong = (np.asarray((x > UNRESOLVED_ERROR).any(axis=1)) for x in (rounding, left))
     if is_rounding[-1]:
         words.append(rounding_words(own.model, amplification, float(own.t[np.argmax(is_rounding)])))
     if wrong.any() and not (event_messages and np.isinf(left[wrong]).all()):

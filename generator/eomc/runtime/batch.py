@@ -16,10 +16,10 @@ from . import batch_adaptive, batch_fixed
 from .arguments import Array, Start, as_count, as_number, as_step_size, row_times, without_mask
 from .batch_trajectory import BatchRun
 from .batch_work import MIN_STEPS_FOR_THREADS, BatchSteps, Instances, Work
-from .integrator import MAX_EVERY, MIN_CHECKED_NUMBERS
+from .integrator import MIN_CHECKED_NUMBERS
 from .model import Model
 from .package import Component, warn, with_events
-from .requests import SimulationArguments, as_progress, step_count
+from .requests import MAX_EVERY, SimulationArguments, as_progress, step_count
 from .stability import MIN_STEPS
 from .starts import initial_state_for_parameters, is_by_name
 from .status import Interrupted

@@ -41,10 +41,6 @@ class CLibrary:
         address, real, null = self.tools
         return null if array is None else address(real, array)
 
-    def has(self, name: str) -> bool:
-        """Return True if the module was built with the C function of this name."""
-        return hasattr(self.lib, name)
-
 
 def next_chunk(count: int, elapsed: float, seconds: float = _SECONDS) -> int:
     """Return the number of items that are expected to take `seconds` to process.

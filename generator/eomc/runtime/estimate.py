@@ -27,8 +27,8 @@ Array = NDArray[Any]
 _MAX_REFINEMENT = 16  # the shortest step of the convergence test is h/16
 _MAX_STEPS = 2_000_000  # refinements of h beyond h/4 have at most so many steps
 _MIN_ROWS = 200  # runs with fewer rows are repeated to find the scale of each coordinate
-_UNRESOLVED = 0.1  # errors above this fraction of a coordinate's scale count as unresolved
-_SATURATION = 0.01  # differences above this fraction of the scale no longer grow linearly
+UNRESOLVED_ERROR = 0.1  # errors above this fraction of a coordinate's scale count as unresolved
+SATURATED_DIFFERENCE = 0.01  # differences above this fraction of the scale no longer grow linearly
 _MAX_SMOOTH_GROWTH = 1e6  # larger growth may come from a discontinuity of the forces
 _REST_ROUNDINGS = 64.0  # velocities that move a position by fewer ulp count as zero
 _GROWTH_STATES = 16  # number of rows of which the mean mass matrix is formed
@@ -141,7 +141,7 @@ def estimate(run: Trajectory, progress: Callable[[int, int], None] | None = None
     names = [*model.info.coordinates, *(f"{c}_dot" for c in model.info.coordinates)]
     with np.errstate(divide="ignore"):
         digits = np.clip(-np.log10(error[-1] / scale), 0.0, -math.log10(eps)) + 0.0  # no -0
-    if (walk[-1] > _UNRESOLVED * scale).any() and _is_discontinuous(run, scale, eps, repeat):
+    if (walk[-1] > UNRESOLVED_ERROR * scale).any() and _is_discontinuous(run, scale, eps, repeat):
         walk *= 0.0
     words = _verdict(
         run, names, error / scale, walk / scale, observed, order, amplification, stopped
@@ -206,7 +206,7 @@ def _growth(
     size = max(20 * walked, 1e4 * eps)
     differences = [moved(size * scale * signs)]
     grown = _local_maximum(np.abs(differences[0])) / size
-    full = np.maximum.accumulate(np.max(grown / scale, axis=1) * size > _SATURATION)
+    full = np.maximum.accumulate(np.max(grown / scale, axis=1) * size > SATURATED_DIFFERENCE)
     if full.any():
         # a smaller perturbation, though with more rounding error relative to it
         less = max(2 * walked, 30 * eps)
@@ -298,7 +298,7 @@ def _is_discontinuous(run: Trajectory, scale: Array, eps: float, repeat: _Repeti
     rows = min(len(base), *map(len, moved))
     with np.errstate(over="ignore", invalid="ignore"):
         large, small = (np.max(np.abs(x[:rows] - base[:rows]) / scale, axis=1) for x in moved)
-    row = int(np.argmax(large > _SATURATION))
+    row = int(np.argmax(large > SATURATED_DIFFERENCE))
     return bool(small[row] > large[row] / 3)
 
 
@@ -441,10 +441,10 @@ def _verdict(
             f"with steps of {abs(stopped.h):.3g} s it stops at t = {stopped.t[-1]:.6g} s "
             f"({stopped.status})"
         )
-    if (walk[-1] > _UNRESOLVED).any():
-        t_limit = run.t[int(np.argmax((walk > _UNRESOLVED).any(axis=1)))]
+    if (walk[-1] > UNRESOLVED_ERROR).any():
+        t_limit = run.t[int(np.argmax((walk > UNRESOLVED_ERROR).any(axis=1)))]
         words.append(rounding_words(run.model, amplification, float(t_limit)))
-    wrong = relative > _UNRESOLVED
+    wrong = relative > UNRESOLVED_ERROR
     if wrong.any():
         row = int(np.argmax(wrong.any(axis=1)))
         name = names[int(np.argmax(relative[row]))]

@@ -28,7 +28,15 @@ from .c_library import next_chunk, slices
 from .inputs import FeedbackLaw, SampledSignal, warn_called_each_step
 from .interfaces import CompiledModel
 from .package import Component, option, warn, with_events
-from .requests import FixedStepRequest, Inputs, SimulationArguments, as_progress, step_count
+from .requests import (
+    FIRST_CALL_NUMBERS,
+    MAX_EVERY,
+    FixedStepRequest,
+    Inputs,
+    SimulationArguments,
+    as_progress,
+    step_count,
+)
 from .stability import MIN_STEPS, LinearizationState, advice
 from .starts import initial_state_for_parameters, is_by_name
 from .status import STATUS, STATUS_MESSAGES, Interrupted, MotionError, state_text
@@ -36,9 +44,7 @@ from .trajectory import Run
 
 _STEPS = 20_000  # steps times coordinates cubed in one call of C, some ms at most
 _MAX_SHORT_STEPS = 999  # of a run in a single call of C
-FIRST_CALL_NUMBERS = 16_384  # steps times coordinates of the first call of C, some ms
 MIN_CHECKED_NUMBERS = 2**24  # positions; larger runs are checked against the memory
-MAX_EVERY = 2**48  # steps from row to row, more than any run makes
 
 
 class Loop(NamedTuple):
@@ -90,11 +96,6 @@ class Integrator(Component):
         self.warned: set[Any] = set()
         self.room = 0
         self.ignores_events = False
-
-    @property
-    def orders(self) -> dict[str, int]:
-        """Order of convergence of each integration method, as a dict by the method's name."""
-        return {name: method.order for name, method in self.info.method_table.items()}
 
     def _loop(self, name: str) -> Loop:
         lib, info = self.c.lib, self.info

@@ -18,15 +18,13 @@ from .c_library import next_chunk
 from .estimate import Estimate, estimate
 from .inputs import FeedbackLaw
 from .interfaces import CompiledModel
-from .requests import FixedStepRequest, count_steps
+from .requests import FIRST_CALL_NUMBERS, MAX_EVERY, FixedStepRequest, count_steps
 from .status import STATUS
 from .trajectory import Run
 from .trajectory_data import parts, within
 
 _ROWS = 4096  # minimum number of rows in the error estimate, if the run has as many steps
-_FIRST = 16_384  # steps times coordinates of the first call of C, some ms
 InputTable = tuple[FeedbackLaw | None, Array | None, int]  # of `Integrator.input_table`
-_RARELY = 2**48  # steps from row to row: C stores the last state only
 
 
 @dataclass(eq=False, repr=False)
@@ -196,7 +194,7 @@ class _IntervalStepper:
         self.extra_evaluations = 0  # of accelerations, in steps to rows between two steps
         self.values: list[Array] = []  # of the law
         numbers = model.info.nq**3 if self.loop.evaluations else model.info.nq
-        self.chunk = max(1, _FIRST // numbers)
+        self.chunk = max(1, FIRST_CALL_NUMBERS // numbers)
 
     @property
     def state(self) -> Array:
@@ -261,7 +259,7 @@ class _IntervalStepper:
         (q, qd), at_p = pair, pointer(self.request.p)
         code = self.loop.run(
             pointer(q), pointer(qd), pointer(q[0]), pointer(qd[0]), t, h, count, at_u, stride,
-            _RARELY, at_p, work,
+            MAX_EVERY, at_p, work,  # C stores the last state only
         )  # fmt: skip
         return STATUS[code & 7]
 

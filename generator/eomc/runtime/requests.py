@@ -31,6 +31,8 @@ Inputs = ArrayLike | Mapping[str, ArrayLike] | Callable[[float, Array, Array], A
 
 MIN_TOLERANCE = {8: 1e-15, 4: 5e-7}  # by the size of a floating-point number in bytes
 MAX_TOLERANCE = 1e-2
+FIRST_CALL_NUMBERS = 16_384  # steps times coordinates of the first call of C, some ms
+MAX_EVERY = 2**48  # steps from row to row, more than any run makes
 _MAX_STEPS = 2**60  # so that C can return four times as many
 
 
