@@ -14,8 +14,10 @@ from pathlib import Path
 
 import pytest
 from c.test_plain import NAMES, VARIANTS, assembled_system, generated, kit
+from cases import SCENES
 from compilers import STRICT, clang, compiled, run
 from conftest import ROOT, needs, tiers
+from executed import RICH
 
 import eomc
 from eomc.base.errors import EomcError
@@ -46,6 +48,24 @@ def test_compilers_issue_no_warnings(which: str, name: str, tmp_path: Path) -> N
         how = [f"-std={standard}", *STRICT[1:], level, "-I.", "-c", *language]
         for file in files:
             compiled(*call, *how, file, cwd=tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", RICH)
+def test_adaptive_steps_and_events_compile_without_warnings(name: str, tmp_path: Path) -> None:
+    options, tables = RICH[name]
+    text = (SCENES / f"{name}.toml").read_text(encoding="utf-8")
+    text = text.replace("[run]\n", "[run]\n" + options) + tables
+    files = eomc.sources(system.from_scene(scene.parse(text, f"{name}.toml"))).files
+    for file in (f"{name}.c", f"{name}.h"):
+        (tmp_path / file).write_text(files[file], encoding="utf-8")
+    for call, standard, language in (
+        ([needs("gcc")], "c99", []),
+        ([needs("g++")], "c++20", ["-x", "c++"]),
+        (clang(False), "c99", []),
+    ):
+        how = [f"-std={standard}", *STRICT[1:], "-O1", "-I.", "-c", *language]
+        compiled(*call, *how, f"{name}.c", cwd=tmp_path)
 
 
 @pytest.mark.slow
