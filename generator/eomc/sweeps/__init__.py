@@ -1,0 +1,1 @@
+"""Sweeps: many trajectories of one scene, block by block, into a store."""

@@ -1,0 +1,399 @@
+"""Plan of a sweep: the checked arguments of `eomc.sweep` or of a file of a sweep, as plain data."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eomc.base import texts
+from eomc.base.errors import EomcError, SceneError
+from eomc.base.resources import __version__
+from eomc.runtime.package import model_of
+from eomc.scene.toml_text import SourceMap, text_and_tree
+from eomc.sweeps.axes import SAMPLERS, SweepError, check_name, read_axis, read_distribution
+
+# arguments of simulate_batch that a sweep passes on
+RUN_OPTIONS = (
+    "duration", "every", "h", "max_evaluations", "max_step", "method", "steps", "stiff", "t0",
+    "times", "tol",
+)  # fmt: skip
+FILE_KEYS = (
+    "bits", "draws", "eomc_sweep", "inputs", "keep", "keep_draws", "over", "reduce", "run", "scene",
+    "seed",
+)  # fmt: skip
+# functions over the rows of a trajectory, which leave out the rows after its end
+OVER_ROWS = {"max": np.fmax.reduce, "min": np.fmin.reduce}
+ONLY_ENDS = 10**9  # steps between two rows, of which then the first and the last remain
+
+
+# receives a BatchTrajectory, and returns a dict of arrays (batch, ...)
+OutputFunction = Callable[[Any], Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class SweepArguments:
+    """Arguments of `eomc.sweep` that determine its results; they are described there."""
+
+    scene: Any
+    over: Mapping[str, Any] = field(default_factory=dict)
+    draws: Mapping[str, Any] = field(default_factory=dict)
+    n: int | None = None
+    sampler: str = "random"
+    seed: int = 0
+    inputs: Mapping[str, float] = field(default_factory=dict)
+    outputs: Any = None
+    reduce: Mapping[str, Any] = field(default_factory=dict)
+    keep_draws: bool | None = None
+    bits: str = "native"
+    run: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything that determines the results of a sweep, as numbers, texts, lists and dicts.
+
+    Attributes
+    ----------
+    name, scene : str
+        Name and text of the scene.
+    over, draws : dict
+        Values of each axis of the grid, and distribution of each drawn quantity, by name.
+    n : int
+        Number of draws at each point of the grid; 0 without draws.
+    outputs : list of str
+        Stored quantities; empty if a function computes them.
+    function : str
+        Digest of the source text of the function that computes the quantities, or "".
+    reduce : dict
+        For each reduced quantity a list of [kind, numbers].
+    every : int
+        Number of steps between two rows; 0 if rows are at times or at adaptive steps.
+    versions : dict of str
+        Versions of the packages on which the values of draws depend.
+    """
+
+    name: str
+    scene: str
+    over: dict[str, list[float]]
+    draws: dict[str, dict[str, Any]]
+    n: int
+    sampler: str
+    seed: int
+    inputs: dict[str, float]
+    outputs: list[str]
+    function: str
+    reduce: dict[str, list[list[Any]]]
+    keep_draws: bool
+    bits: str
+    run: dict[str, Any]
+    every: int
+    starts: list[str]
+    versions: dict[str, str]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of trajectories along each dimension."""
+        draws = (self.n,) if self.draws else ()
+        return (*(len(values) for values in self.over.values()), *draws)
+
+    @property
+    def dims(self) -> tuple[str, ...]:
+        """Names of the dimensions."""
+        return (*map(self.label, self.over), *(("draw",) if self.draws else ()))
+
+    @property
+    def size(self) -> int:
+        """Number of trajectories."""
+        return math.prod(self.shape)
+
+    def label(self, name: str) -> str:
+        """Return the name of a varied quantity in the Dataset.
+
+        Initial values get "_start", since the plain name is that of the final value.
+        """
+        return f"{name}_start" if name in self.starts else name
+
+    @cached_property
+    def digest(self) -> str:
+        """The SHA-256 of the plan."""
+        return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()
+
+    def can_grow_to(self, other: Plan) -> bool:
+        """Return True if another plan is the same but for a larger number of draws."""
+        is_longer = other.n > self.n and self.sampler != "latin"
+        return is_longer and replace(self, n=other.n) == other
+
+    def differences(self, other: Plan) -> Iterator[str]:
+        """Yield a line for each difference from another plan, such as "seed: 0 there, 1 now"."""
+        old, new = _flatten(asdict(self)), _flatten(asdict(other))
+        for key in sorted({*old, *new}):
+            if old.get(key) != new.get(key):
+                if key in ("scene", "function"):
+                    yield f"{key}: another text there"
+                else:
+                    yield f"{key}: {_shorten(old.get(key))} there, {_shorten(new.get(key))} now"
+
+
+def _flatten(tree: dict[str, Any]) -> dict[str, Any]:
+    """Return a dict of dicts as one dict; keys of `run` stand alone, others as "draws.m"."""
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            flat.update({k if key == "run" else f"{key}.{k}": v for k, v in value.items()})
+        else:
+            flat[key] = value
+    return flat
+
+
+def _shorten(value: Any) -> str:
+    if isinstance(value, list) and len(value) > 3:
+        first, second, *_, last = map(json.dumps, value)
+        return f"[{first}, {second}, ..., {last}] ({len(value)} values)"
+    text = "nothing" if value is None else json.dumps(value)
+    return text if len(text) < 60 else f"{text[:57]}..."
+
+
+# --- arguments ------------------------------------------------------------------------------------
+
+
+def read_scene(scene: Any) -> tuple[str, str]:
+    """Return the name (of the file or of the model) and the text of a scene.
+
+    scene: path of a scene, or a module of `eomc.load` from one. Raises SweepError if there is no
+    such text.
+    """
+    model = model_of(scene)
+    source = scene if model is None else model.source
+    if not isinstance(source, (str, Path)):
+        what = "a System" if model is None else "a module that was not loaded from a scene"
+        why = f"{what} has no text to send to workers: write it as a scene, and give its path"
+        raise SweepError(("scene",), why)
+    try:
+        data = Path(source).read_bytes()
+    except OSError as fault:
+        why = f"{texts.line(str(source))} can't be read ({fault.strerror})"
+        raise SweepError(("scene",), why) from None
+    if model is not None and hashlib.sha256(data).hexdigest() != model.info.digest:
+        raise SweepError(("scene",), f"{source} has changed since it was loaded: load it again")
+    return Path(source).stem, data.decode("utf-8-sig", errors="surrogateescape")
+
+
+def make_plan(arguments: SweepArguments, model: Any, scene: tuple[str, str]) -> Plan:
+    """Check the arguments of a sweep, and return them as a plan.
+
+    model: module of the scene. scene: its name and text. Raises SweepError for a wrong argument.
+    """
+    import scipy
+
+    a, starts = arguments, [x for c in model.coordinates for x in (c, f"{c}_dot")]
+    known = [*starts, *model.parameters, *model.inputs]
+    for table in ("over", "draws", "inputs", "reduce"):
+        if not isinstance(x := getattr(a, table), Mapping):
+            raise SweepError((table,), f"give a dict of names and values, here {x!r}")
+    for table in ("over", "draws"):
+        for name in getattr(a, table):
+            what = f"no coordinate, rate, parameter or input of {scene[0]}"
+            check_name((table, name), name, known, what)
+    if both := sorted({*a.over} & {*a.draws}):
+        raise SweepError(("draws", both[0]), "is in over as well: give it once")
+    if not a.over and not a.draws:
+        raise SweepError(("over",), "nothing varies: give over or draws (--over, --draw)")
+    for name in a.inputs:
+        check_name(("inputs", name), name, model.inputs, f"no input of {scene[0]}")
+    check_name(("bits",), a.bits, ("native", "portable"), f"no kind {a.bits!r}")
+    run = _read_run(a.run)
+    outputs = _read_outputs(a, starts)
+    reduce = {name: _read_reductions(("reduce", name), x) for name, x in a.reduce.items()}
+    if reduce and not a.draws:
+        raise SweepError(("reduce",), "reductions are over draws: give draws and n")
+    for table, names in (("keep", outputs), ("reduce", reduce)):
+        for name in () if callable(a.outputs) else names:
+            path = (table, name) if table == "reduce" else (table,)
+            _check_quantity(path, name, model_of(model).info, starts)
+    return Plan(
+        name=scene[0], scene=scene[1],
+        over={name: read_axis(("over", name), x) for name, x in a.over.items()},
+        draws={name: read_distribution(("draws", name), x) for name, x in a.draws.items()},
+        n=_read_count(a), sampler=a.sampler, seed=_read_integer("seed", a.seed),
+        inputs={name: float(x) for name, x in a.inputs.items()}, outputs=outputs,
+        function=_source_digest(a.outputs) if callable(a.outputs) else "",
+        reduce=reduce, keep_draws=not reduce if a.keep_draws is None else bool(a.keep_draws),
+        bits=a.bits, run=run, every=_choose_rows(a, model, run, [*outputs, *reduce]), starts=starts,
+        versions={"eomc": __version__, "numpy": np.__version__, "scipy": scipy.__version__},
+    )  # fmt: skip
+
+
+def _read_integer(name: str, value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
+        raise SweepError((name,), f"give an integer, 0 or more, here {value!r}")
+    return int(value)
+
+
+def _read_count(a: SweepArguments) -> int:
+    """Return the number of draws, 0 without draws."""
+    check_name(("draws", "sampler"), a.sampler, SAMPLERS, f"no sampler {a.sampler!r}")
+    if not a.draws:
+        if a.n is not None:
+            raise SweepError(("draws", "n"), "the number of draws goes with draws: give them")
+        return 0
+    if a.n is None or (n := _read_integer("n", a.n)) < 1:
+        raise SweepError(("draws", "n"), "how many draws? such as n=100_000")
+    if a.sampler == "latin" and n > 10**7:
+        why = 'a Latin hypercube of more than 10**7 points: take "sobol"'
+        raise SweepError(("draws", "sampler"), why)
+    if a.sampler == "sobol" and n > 2**30:
+        raise SweepError(("draws", "sampler"), 'Sobol sequences end at 2**30: take "random"')
+    return n
+
+
+def _read_run(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of a run as plain numbers, texts and lists."""
+    run = {}
+    for name, value in options.items():
+        check_name(("run", name), name, RUN_OPTIONS, "no option of a run")
+        if name == "times":
+            value = read_axis(("run", "times"), value)
+        if value is not None:
+            run[name] = value.item() if isinstance(value, np.generic) else value
+    return run
+
+
+def _read_outputs(a: SweepArguments, starts: list[str]) -> list[str]:
+    """Return the names of stored quantities."""
+    if callable(a.outputs):
+        return []
+    if a.outputs is None:
+        return [] if a.reduce else starts
+    if isinstance(a.outputs, str) or not all(isinstance(x, str) for x in a.outputs):
+        raise SweepError(("keep",), f"give a list of names or a function, here {a.outputs!r}")
+    return [name for name in dict.fromkeys(a.outputs) if name not in a.reduce]
+
+
+def _read_reductions(path: tuple[str, ...], value: Any) -> list[list[Any]]:
+    """Return the reductions of a quantity as a list of [kind, numbers]."""
+    example = 'give "mean", ("histogram", edges) or ("quantile", [0.05, 0.95])'
+    if isinstance(value, list):
+        return [x for each in value for x in _read_reductions(path, each)]
+    if value == "mean":
+        return [["mean", []]]
+    if isinstance(value, Mapping) and len(value) == 1:
+        value = next(iter(value.items()))
+    if not isinstance(value, tuple) or len(value) != 2 or value[0] not in ("histogram", "quantile"):
+        raise SweepError(path, f"{example}, here {value!r}")
+    kind, numbers = value[0], read_axis(path, value[1])
+    if kind == "histogram" and (len(numbers) < 2 or np.any(np.diff(numbers) <= 0)):
+        raise SweepError(path, "histogram: give two or more ascending edges")
+    if kind == "quantile" and not all(0 <= x <= 1 for x in numbers):
+        raise SweepError(path, f"quantile: give probabilities from 0 to 1, here {numbers}")
+    return [[kind, numbers]]
+
+
+def _check_quantity(path: tuple[str, ...], name: str, info: Any, starts: Sequence[str]) -> None:
+    """Raise SweepError unless `name` is COLUMN, COLUMN.max, .min or .end, or EVENT.time and others.
+
+    info: facts about the scene. starts: names of coordinates and rates.
+    """
+    head, dot, tail = name.partition(".")
+    columns = [*starts, *info.inputs, *info.outputs, "energy"]
+    what = f"{head!r} is no column or event of {info.name}"
+    check_name(path, head, [*columns, *info.events], what)
+    known = [*OVER_ROWS, "end"] if head in columns else ["time", "count", *starts]
+    if (dot or head not in columns) and tail not in known:
+        raise SweepError(path, f"after {head} and a dot: {', '.join(known)}, here {tail!r}")
+
+
+def _choose_rows(
+    a: SweepArguments, model: Any, run: dict[str, Any], quantities: Sequence[str]
+) -> int:
+    """Return the number of steps between two rows; 0 if rows are not counted in steps."""
+    every = run.pop("every", None)
+    over_rows = [name for name in quantities if name.partition(".")[2] in OVER_ROWS]
+    try:
+        is_adaptive = model.simulate_batch(threads=1, **run).tol > 0
+    except (ValueError, TypeError) as fault:
+        name, _, why = str(fault).partition(": ")
+        path = ("run", name) if name in run else ("run",)
+        raise SweepError(path, why if name in run else str(fault)) from None
+    if "times" in run or is_adaptive:
+        if every is not None:
+            raise SweepError(
+                ("run", "every"), "counts fixed steps: leave it out, or leave out times"
+            )
+        if over_rows and "times" not in run:
+            why = "adaptive steps have rows at the start and at the end alone: give times"
+            raise SweepError(("keep", over_rows[0]), why)
+        return 0
+    if over_rows or callable(a.outputs):
+        return _read_integer("every", 1 if every is None else every)
+    return ONLY_ENDS
+
+
+def _source_digest(function: OutputFunction) -> str:
+    """Return the digest of the source text of a function, by which a resumed sweep compares it."""
+    try:
+        return hashlib.sha256(inspect.getsource(function).encode()).hexdigest()
+    except (OSError, TypeError):
+        why = "a function without source text can't be compared when the sweep goes on: "
+        raise SweepError(("outputs",), f"{why}write it into a file") from None
+
+
+# --- files ----------------------------------------------------------------------------------------
+
+
+def read_file(file: Path) -> tuple[SweepArguments, SourceMap]:
+    """Read the file of a sweep; return its arguments, and the places of its keys for messages.
+
+    The file may also be a scene, of which then nothing varies.
+
+    Raises EomcError if the file can't be read, and SceneError with the place of a fault in it.
+    """
+    shown = texts.line(str(file))
+    try:
+        data = file.read_bytes()
+    except OSError as fault:
+        raise EomcError(f"{shown}: can't be read ({fault.strerror})") from None
+    if not data.strip():
+        raise EomcError(f"{shown}: is empty: name a scene in it, and what varies under [over]")
+    text, tree = text_and_tree(data, shown)
+    places = SourceMap(text, shown)
+    if "eomc_sweep" not in tree and "eomc" in tree:
+        return SweepArguments(scene=file), places
+    try:
+        return _read_tree(tree, file.parent), places
+    except SweepError as fault:
+        raise place_error(fault, places) from None
+
+
+def _read_tree(tree: Mapping[str, Any], folder: Path) -> SweepArguments:
+    """Return the arguments in the tree of a file of a sweep."""
+    for key in tree:
+        check_name((key,), key, FILE_KEYS, "no key of a sweep")
+    if tree.get("eomc_sweep") != 1:
+        raise SweepError(("eomc_sweep",), "write eomc_sweep = 1, the version of the format")
+    if not isinstance(tree.get("scene"), str):
+        raise SweepError(("scene",), 'name the file of the scene, such as scene = "cartpole.toml"')
+    tables = ("over", "draws", "inputs", "run", "reduce")
+    for key in tables:
+        if not isinstance(tree.get(key, {}), dict):
+            raise SweepError((key,), f"is a table: write [{key}]")
+    over, draws, inputs, run, reduce = (dict(tree.get(key, {})) for key in tables)
+    return SweepArguments(
+        scene=folder / tree["scene"], over=over, n=draws.pop("n", None),
+        sampler=draws.pop("sampler", "random"), draws=draws, seed=tree.get("seed", 0),
+        inputs=inputs, outputs=tree.get("keep"), reduce=reduce, keep_draws=tree.get("keep_draws"),
+        bits=tree.get("bits", "native"), run=run,
+    )  # fmt: skip
+
+
+def place_error(fault: SweepError, places: SourceMap) -> SceneError:
+    """Return the error for a fault in the file of a sweep, with the line of the argument."""
+    return SceneError([places.problem(fault.path, fault.message)])

@@ -1,0 +1,307 @@
+"""Store of a sweep: a Zarr group with the plan, whose arrays are cut into blocks.
+
+A block is one chunk (or one shard) of every array, so that no two tasks write the same file, and
+Zarr writes each file under a temporary name. A block is finished if its chunk of `status` exists,
+which is written last. The fill value of `status` is NOT_RUN, since Zarr writes no chunk that is
+equal to the fill value.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import os
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import numpy as np
+
+from eomc.base import texts
+from eomc.base.errors import EomcError
+from eomc.sweeps.axes import Array, SweepError
+from eomc.sweeps.plan import Plan
+from eomc.sweeps.reductions import LEAF, part_width
+
+NOT_RUN = 255
+MARK = "eomc_sweep"  # attribute of the group
+INNER_CHUNK = 1 << 16  # trajectories that a reader gets at once from a larger block
+Region = tuple[slice, ...]
+
+
+@dataclass(frozen=True)
+class ArrayLayout:
+    """Shape of an array of a store, and how it is cut.
+
+    dims: names of the dimensions. chunk: part of the shape that one block writes. is_sparse:
+    whether most values are 0, so that compression pays.
+    """
+
+    dims: tuple[str, ...]
+    shape: tuple[int, ...]
+    chunk: tuple[int, ...]
+    dtype: str
+    fill: float
+    is_sparse: bool = False
+
+    @property
+    def bytes(self) -> int:
+        """Size of the array without compression."""
+        return math.prod(self.shape) * np.dtype(self.dtype).itemsize
+
+
+def choose_block_size(plan: Plan, seconds: float, threads: int, workers: int) -> int:
+    """Return the number of trajectories of a block: two seconds of work, at least 8 a worker.
+
+    seconds: computing time of one trajectory. The number is LEAF times a power of two; no result
+    depends on it.
+    """
+    most = min(2.0 * threads / max(seconds, 1e-9), plan.size / (8 * workers), 1 << 20)
+    return LEAF << max(0, int(math.log2(max(most / LEAF, 1))))
+
+
+def cut_block(plan: Plan, size: int) -> tuple[int, ...]:
+    """Return the shape of a block of at most about `size` trajectories.
+
+    A block contains trailing axes as a whole, and a part of the axis before them. Along the draws
+    its length is all of them if they are few, otherwise LEAF times a power of two.
+    """
+    shape = list(plan.shape)
+    if plan.draws and shape[-1] > LEAF:
+        shape[-1] = LEAF << math.ceil(math.log2(shape[-1] / LEAF))
+        size = LEAF << max(0, int(math.log2(max(size / LEAF, 1))))
+    return _cut(shape, size)
+
+
+def _cut(shape: Sequence[int], size: int) -> tuple[int, ...]:
+    """Return trailing axes of a shape as a whole, a part of the next, and 1 for the others."""
+    part = list[int]()
+    for n in reversed(shape):
+        k = max(1, min(n, size))
+        part.insert(0, k)
+        size = size // k if k == n else 1
+    return tuple(part)
+
+
+def _inner_chunk(chunk: tuple[int, ...], dimensions: int) -> tuple[int, ...] | None:
+    """Return the inner chunks of a shard, or None if they don't divide it or are all of it."""
+    inner = _cut(chunk[:dimensions], INNER_CHUNK) + chunk[dimensions:]
+    divides = all(n % k == 0 for n, k in zip(chunk, inner, strict=True))
+    return inner if divides and inner != chunk else None
+
+
+def lay_out(
+    plan: Plan, block: tuple[int, ...], quantities: Mapping[str, tuple[str, tuple[int, ...]]]
+) -> dict[str, ArrayLayout]:
+    """Return the arrays of a store by name.
+
+    block: shape of a block. quantities: for each quantity the type and the shape of the values of
+    one trajectory. Raises SweepError for reductions that are not of one number.
+    """
+    dims, shape = plan.dims, plan.shape
+    layouts = {"status": ArrayLayout(dims, shape, block, "uint8", NOT_RUN)}
+    if missing := [name for name in plan.reduce if name not in quantities]:
+        there = ", ".join(quantities)
+        raise SweepError(("reduce", missing[0]), f"the function returns no such name, but {there}")
+    for name, (dtype, extra) in quantities.items():
+        if name in plan.reduce:
+            if extra:
+                raise SweepError(("reduce", name), "has several numbers a trajectory: reduce one")
+            blocks = -(-shape[-1] // block[-1])
+            for kind, numbers in plan.reduce[name]:
+                width = part_width(kind, numbers)
+                layouts[part_name(name, kind)] = ArrayLayout(
+                    (*dims[:-1], "block", f"{name}_{kind}_part"), (*shape[:-1], blocks, width),
+                    (*block[:-1], 1, width), "float64" if kind == "mean" else "int64", 0,
+                    kind == "quantile",
+                )  # fmt: skip
+            continue
+        own = [f"{name}_{k}" for k in range(len(extra))]
+        if extra and "." not in name and not plan.function:
+            own = ["t"]
+        fill = np.nan if np.dtype(dtype).kind == "f" else 0
+        layouts[name] = ArrayLayout((*dims, *own), (*shape, *extra), (*block, *extra), dtype, fill)
+    for name in plan.draws if plan.keep_draws else ():
+        layouts[plan.label(name)] = ArrayLayout(dims, shape, block, "float64", np.nan)
+    return layouts
+
+
+def part_name(name: str, kind: str) -> str:
+    """Return the name of the array with the blocks' parts of a reduction."""
+    return f"{name}_{kind}_parts"
+
+
+@contextmanager
+def hold_store(path: Path) -> Iterator[None]:
+    """Lock a store while the block runs. Raises EomcError if another sweep has locked it.
+
+    The lock file is in the parent folder, since Zarr warns of other files in the store. The lock
+    ends with the process.
+    """
+    from eomc.toolchain.cache import hold_lock
+
+    refusal = (
+        f"{texts.line(str(path))}: another sweep writes here: wait for it, or give another store"
+    )
+    with hold_lock(path.with_name(f"{path.name}.lock"), refusal):
+        yield
+
+
+def read_plan(path: Path) -> Plan | None:
+    """Return the plan of a store; None if the folder is missing or empty.
+
+    Raises EomcError if the folder contains something else.
+    """
+    import zarr
+
+    shown = texts.line(str(path))
+    if path.is_file():
+        raise EomcError(f"{shown}: is a file: give a folder")
+    if not path.is_dir() or not any(path.iterdir()):
+        return None
+    try:
+        attributes = zarr.open_group(str(path), mode="r").attrs
+        if MARK in attributes:
+            return Plan(**attributes[MARK])
+    except TypeError:
+        raise EomcError(f"{shown}: is a store of another version of eomc: give another") from None
+    except (FileNotFoundError, KeyError, ValueError):
+        pass
+    raise EomcError(f"{shown}: is no store of a sweep, and not empty: give another folder")
+
+
+def create_store(
+    path: Path, plan: Plan, layouts: Mapping[str, ArrayLayout], facts: Mapping[str, Any]
+) -> None:
+    """Create the store of a sweep, unless another process does so at the same time.
+
+    The store is created under a temporary name. facts: further attributes of the group, among them
+    "block", the shape of a block.
+    """
+    import zarr
+    from zarr.codecs import ZstdCodec
+
+    new = path.with_name(f".{path.name}.{uuid4().hex}")
+    try:
+        group = zarr.create_group(str(new), zarr_format=3)
+        coordinates = {plan.label(name): values for name, values in plan.over.items()}
+        if "times" in plan.run:
+            coordinates["t"] = plan.run["times"]
+        for name, values in coordinates.items():
+            group.create_array(name, data=np.asarray(values), dimension_names=[name])
+        for name, layout in layouts.items():
+            inner = _inner_chunk(layout.chunk, len(plan.shape))
+            group.create_array(
+                name, shape=layout.shape, chunks=inner or layout.chunk,
+                shards=layout.chunk if inner else None, dtype=layout.dtype, fill_value=layout.fill,
+                dimension_names=layout.dims, compressors=ZstdCodec() if layout.is_sparse else None,
+            )  # fmt: skip
+        group.attrs.put({**facts, MARK: asdict(plan)})
+        with suppress(OSError):  # the other process has been quicker
+            new.rename(path)
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+
+
+class Store:
+    """An existing store of a sweep.
+
+    Attributes
+    ----------
+    path, plan
+        Folder and plan of the sweep.
+    facts : dict
+        Other attributes of the group.
+    block, counts : tuple of int
+        Shape of a block, and numbers of blocks along each dimension.
+    """
+
+    def __init__(self, path: Path) -> None:
+        import zarr
+
+        self.path = path
+        self.group = zarr.open_group(str(path), mode="r+")
+        self.facts: dict[str, Any] = dict(self.group.attrs)
+        self.plan = Plan(**self.facts.pop(MARK))
+        self.block = tuple(self.facts["block"])
+        self.counts = tuple(-(-n // k) for n, k in zip(self.plan.shape, self.block, strict=True))
+        self.arrays = {name: array.async_array for name, array in self.group.arrays()}
+
+    @property
+    def stamp(self) -> str:
+        """Text that changes with the plan and the blocks of the store."""
+        return f"{self.plan.digest} {self.block}"
+
+    @property
+    def blocks(self) -> int:
+        """Number of blocks."""
+        return math.prod(self.counts)
+
+    def place(self, number: int) -> tuple[tuple[int, ...], Region]:
+        """Return the position of a block among the blocks, and its slices of the shape."""
+        at = tuple(int(k) for k in np.unravel_index(number, self.counts))
+        cut = zip(at, self.block, self.plan.shape, strict=True)
+        return at, tuple(slice(k * size, min((k + 1) * size, n)) for k, size, n in cut)
+
+    def finished(self) -> Array:
+        """Return whether each block is finished, (blocks,): one listing of names of files."""
+        there = np.zeros(self.counts, bool)
+        root = self.path / "status" / "c"
+        for folder, _, files in os.walk(root):
+            parts = Path(folder).relative_to(root).parts
+            for file in files if len(parts) == len(self.counts) - 1 else ():
+                if file.isdigit():  # files that are being written end in .partial
+                    there[tuple(map(int, (*parts, file)))] = True
+        return there.ravel()
+
+    def write(self, values: Sequence[tuple[str, Region, Array]]) -> None:
+        """Write parts of arrays at once, which takes half of the time of one after the other."""
+
+        async def write_all() -> None:
+            writes = (self.arrays[name].setitem(region, x) for name, region, x in values)
+            await asyncio.gather(*writes)
+
+        asyncio.run(write_all())
+
+    def grow(self, plan: Plan) -> None:
+        """Make room for more draws; the blocks at the previous end are computed again.
+
+        Raises EomcError if there are so few draws that a block does not end at a leaf.
+        """
+        if self.block[-1] % LEAF:
+            shown, n = texts.line(str(self.path)), self.plan.n
+            raise EomcError(f"{shown}: a store of {n} draws can't grow: give another store")
+        if self.plan.n % self.block[-1]:
+            for file in (self.path / "status" / "c").rglob(str(self.counts[-1] - 1)):
+                if file.is_file():
+                    file.unlink()
+        axis, blocks = len(plan.shape) - 1, -(-plan.n // self.block[-1])
+        for _, array in self.group.arrays():
+            shape = list(array.shape)
+            if len(shape) > axis and array.metadata.dimension_names[axis] in ("draw", "block"):
+                is_part = array.metadata.dimension_names[axis] == "block"
+                shape[axis] = blocks if is_part else plan.n
+                array.resize(tuple(shape))
+        self.group.attrs[MARK] = asdict(plan)
+
+    def remove_partial_files(self) -> None:
+        """Remove the incomplete files that killed workers have left."""
+        for file in self.path.rglob("*.partial"):
+            file.unlink(missing_ok=True)
+
+
+@lru_cache(maxsize=8)
+def open_store(path: str, stamp: str) -> Store:
+    """Return a store, which is opened once in a process: metadata take 0.7 ms an array.
+
+    stamp: that of the store, so that a changed store is opened again.
+    """
+    store = Store(Path(path))
+    if store.stamp != stamp:
+        raise SweepError((), f"{texts.line(path)}: was replaced while the sweep ran")
+    return store
