@@ -61,9 +61,13 @@ lint: .venv/dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy -p eomc --cache-dir build/mypy
 
+# the C of csrc/solver and its tests
+format-c: .venv/dev
+	$(BIN)/python tests/c/c_format.py
+
 golden: .venv/test
 	$(BIN)/python tests/c/test_golden.py --accept
-	$(BIN)/python tests/scene/test_bad_scenes.py
+	$(BIN)/python tests/support/bad_scenes.py
 	PYTHONPATH=tests $(BIN)/python tests/report/test_drawing.py
 	PYTHONPATH=tests $(BIN)/python tests/report/test_picture_images.py
 
@@ -76,6 +80,7 @@ bench: build/bench/done
 	build/bench/bin/python benchmarks/adaptive_batches.py
 	build/bench/bin/python benchmarks/constrained.py
 	build/bench/bin/python benchmarks/iftomm.py
+	build/bench/bin/python benchmarks/sweep.py
 
 # what the LaTeX of equations is compiled with, where npm is there; else that test is skipped
 build/katex/done:
@@ -118,7 +123,7 @@ clean:
 	@touch $@ .venv/test .venv/demo
 
 # half a gigabyte of robots, the simulator that they are held against, compilers for other machines,
-# importers of units of FMI
+# importers of units of FMI, Dask for sweeps
 .venv/robots: .venv/dev
-	$(INSTALL) --editable ".[robots,cross,fmu]"
+	$(INSTALL) --editable ".[robots,cross,fmu,cluster]"
 	@touch $@

@@ -30,10 +30,10 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 sys.path.insert(0, str(ROOT / "tests"))
 
-from cases import cases, scene_text  # noqa: E402
+from support.cases import cases, scene_text  # noqa: E402
 
 import eomc  # noqa: E402
-from eomc.model.from_scene import from_scene  # noqa: E402
+from eomc.model.system import from_scene  # noqa: E402
 from eomc.scene.read import parse  # noqa: E402
 
 TARGETS = (1e-9, 1e-12)

@@ -19,13 +19,13 @@ from pathlib import Path
 import heyoka
 import numpy as np
 from adaptive import LOOSEST, ROOT, TIGHTEST
-from cases import scene_text
 from machine import CORES, machine
 from searching import Array, timed
+from support.cases import scene_text
 from taylor import FORMS, Taylor
 
 import eomc
-from eomc.model.from_scene import from_scene
+from eomc.model.system import from_scene
 from eomc.scene.read import parse
 
 MANY, WANTED, BAR = 4096, 1e-9, 0.35

@@ -26,7 +26,7 @@ from kernels import Array
 
 import eomc
 from eomc.derive import lagrange
-from eomc.model.from_scene import from_scene
+from eomc.model.system import from_scene
 from eomc.program import program
 from eomc.scene.read import parse
 

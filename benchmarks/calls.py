@@ -1,15 +1,13 @@
-"""What a call and an import of a built module cost beside the steps themselves.
+"""What a call and an import of a built module cost beside the loop in C.
 
     python benchmarks/calls.py [--rounds 25]
 
-- overhead of `simulate(steps=10)`: its time less ten steps' time; a step's time is the slope
-  between runs of 2,000 and 12,000 steps, in the same rounds; in processor time of the thread, so
-  that others on the same core do not count. On a machine shared with others it comes in two sizes,
-  up to 1.8 apart: where somebody else has the other half of the physical core, an interpreter gets
-  half of the instructions through, while a chain of dependent multiplications takes no longer;
-- overhead of `simulate()` by a tolerance: beside the same steps in C, which keep no rows; with an
-  input that is held, too;
-- `step_batch` of eight instances, whole: it has no bar, but learning loops pay it in every step;
+- a call of `simulate` or `simulate_batch`, and the loop in C that it makes: the C function with the
+  same arguments and rows. Both are processor times of the thread, so that others on the same core
+  do not count, and the least of the rounds, which alternate. On a machine shared with others they
+  come in two sizes, up to 1.8 apart: where somebody else has the other half of the physical core,
+  an interpreter gets half of the instructions through;
+- `step_batch` of eight instances, whole: learning loops pay it in every step;
 - import: of a built scene in a fresh process, bytecode in place, after NumPy is there.
 """
 
@@ -24,15 +22,18 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import work
-from searching import adaptive_in_c
 
 import eomc
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
-CALL_BAR, FIT_BAR, IMPORT_BAR = 5e-6, 3e-6, 50e-3  # s
+OVERHEAD_BAR, IMPORT_BAR = 2e-6, 50e-3  # s
+MANY = 200  # calls in a row
+H, STEPS, DURATION, TOL, COUNT = 0.005, 10, 0.5, 1e-9, 8
 IMPORT = """
 import sys, time, numpy
 sys.path[:0] = [sys.argv[1]]
@@ -42,106 +43,167 @@ print(time.perf_counter() - begun)
 """
 
 
-def quartiles(values: list[float]) -> tuple[float, float, float]:
-    low, middle, high = np.percentile(values, [25, 50, 75])
-    return float(low), float(middle), float(high)
+def loop_in_c(
+    module: ModuleType, count: int, times: Any = None, u: Any = None, **options: Any
+) -> Callable[[], object]:
+    """Return the loop in C of a run with so many rows, after steps or at times.
 
-
-def seconds(call: Callable[[], object], many: int) -> float:
-    """The mean over many calls in a row, processor time."""
-    begun = time.thread_time()
-    for _ in range(many):
-        call()
-    return (time.thread_time() - begun) / many
-
-
-def call_overhead(root: Path, rounds: int) -> tuple[float, float, float]:
-    """Quartiles over the rounds of simulate(steps=10) less ten steps, s."""
-    module = work.load(work.CASES["cart-pole"], root)
-    module.simulate(steps=12_000)
-    found = []
-    for _ in range(rounds):
-        short = seconds(lambda: module.simulate(steps=10), 300)
-        few = seconds(lambda: module.simulate(steps=2_000, every=2_000), 3)
-        more = seconds(lambda: module.simulate(steps=12_000, every=12_000), 3)
-        found.append(short - 10 * (more - few) / 10_000)
-    return quartiles(found)
-
-
-def adaptive_overhead(root: Path, rounds: int, driven: bool = False) -> tuple[float, float, float]:
-    """Quartiles over the rounds of simulate() by a tolerance less its loop in C, s.
-
-    driven: with an input that is held.
+    options: members of the C struct.
     """
-    if driven:
-        text = (SCENES / "cartpole_driven.toml").read_text(encoding="utf-8")
-        (root / "driven.toml").write_text(text + "tolerance = 1e-9\n", encoding="utf-8")
-        module = eomc.load(root / "driven.toml", root)
-    else:
-        module = work.load(work.CASES["cart-pole"], root, "tolerance = 1e-9\n")
-    u = np.array([0.5]) if driven else None
-    bare = adaptive_in_c(module, 1.0, 1e-9, u)
+    model = module._model
+    (address, real, null), ffi, nq = model.c.tools, model.c.ffi, model.info.nq
+    q, qd, p = model.arguments.default_pointers
+    struct, output = ffi.new("run_options *", options), ffi.new("run_output *")
+    rows, nothing = np.empty((1 + 2 * nq) * count), bytes(ffi.sizeof("run_output"))
+    to, at_u = address(real, rows), null if u is None else address(real, u)
+    stride = model.info.nu if u is not None and u.ndim == 2 else 0
+    at_times = null if times is None else address(real, times)
+    integrate, size = model.c.lib.integrate, len(nothing)
 
     def run() -> object:
-        return module.simulate(duration=1.0, tol=1e-9, u=u)
+        ffi.memmove(output, nothing, size)
+        integrate(
+            struct, output, null, q, qd, at_times, count, at_u, stride, p, to, to + count, null,
+        )  # fmt: skip
+        return rows, times, u
 
-    run()
-    return quartiles([seconds(run, 300) - seconds(bare, 300) for _ in range(rounds)])
+    return run
 
 
-def batch_call(root: Path, rounds: int) -> tuple[float, float, float]:
-    """Quartiles over the rounds of a step of eight instances, s."""
+def fixed_loop(module: ModuleType, times: Any = None, u: Any = None) -> Callable[[], object]:
+    """Return the loop in C of steps of equal size, with rows after each of them or at times."""
+    count = 1 + STEPS if times is None else len(times)
+    return loop_in_c(module, count, times, u, h=H, steps=STEPS, every=1)
+
+
+def adaptive_loop(module: ModuleType, times: Any = None, u: Any = None) -> Callable[[], object]:
+    """Return the loop in C of adaptive steps, with rows after each step or at times."""
+    count = 200 if times is None else len(times)
+    return loop_in_c(module, count, times, u, tol=TOL, t_end=DURATION, steps=199, every=1)
+
+
+def batch_loop(module: ModuleType, u: Any = None) -> Callable[[], object]:
+    """Return the loop in C of steps of equal size of eight instances."""
+    model, count, n = module._model, COUNT, 1 + STEPS
+    (address, real, null), ffi, nq = model.c.tools, model.c.ffi, model.info.nq
+    start = np.tile(np.array(module.start)[:, None], (1, count, 1))
+    state, rows = start.copy(), np.empty((2, count, n, nq))
+    to, at = address(real, rows), address(real, state)
+    options = ffi.new("run_options *", {"h": H, "steps": STEPS, "every": 1, "rows": n})
+    options.u_instance = 0 if u is None else model.info.nu
+    outputs, memory = ffi.new("run_output[]", count), ffi.new("run_memory[]", count)
+    nothing, lib = bytes(ffi.sizeof(outputs)), model.c.lib
+    at_u, p = null if u is None else address(real, u), model.arguments.default_pointers[2]
+
+    def run() -> object:
+        state[:] = start
+        ffi.memmove(outputs, nothing, len(nothing))
+        lib.begin_batch(count, to, to + count * n * nq, n, memory, outputs)
+        lib.integrate_batch(options, count, at, at + count * nq, null, at_u, p, outputs)
+        return rows, u
+
+    return run
+
+
+Calls = dict[str, tuple[Callable[[], object], Callable[[], object]]]
+
+
+def calls(module: ModuleType) -> Calls:
+    """Return for each title a call, and the loop in C that it makes."""
+    u, table = np.array([0.5]), np.linspace(-1.0, 1.0, STEPS)[:, None]
+    times, steps = np.linspace(0.0, DURATION, 11), H * np.arange(STEPS + 1)
+    q, qd = (np.tile(x, (COUNT, 1)) for x in module.start)
+    each, p, start = np.tile(u, (COUNT, 1)), {"m_c": 3.0}, module.start
+    simulate: Callable[..., Any] = module.simulate
+    batch: Callable[..., Any] = module.simulate_batch
+    fixed, adaptive = fixed_loop(module), adaptive_loop(module)
+    return {
+        "`simulate(steps=10)`": (lambda: simulate(steps=STEPS), fixed),
+        "`simulate(q0, qd0, steps=10)`": (lambda: simulate(*start, steps=STEPS), fixed),
+        "`simulate(h=, duration=)`": (lambda: simulate(h=H, duration=H * STEPS), fixed),
+        "`simulate(h=, u=, steps=10)`": (
+            lambda: simulate(h=H, u=u, steps=STEPS), fixed_loop(module, u=u),
+        ),
+        "`simulate(u=TABLE, steps=10)`": (
+            lambda: simulate(u=table, steps=STEPS), fixed_loop(module, u=table),
+        ),
+        "`simulate(params=, steps=10)`": (lambda: simulate(params=p, steps=STEPS), fixed),
+        "`simulate(h=, times=)`": (
+            lambda: simulate(h=H, times=steps), fixed_loop(module, steps),
+        ),
+        "`simulate(tol=)`": (lambda: simulate(tol=TOL, duration=DURATION), adaptive),
+        "`simulate(tol=, u=)`": (
+            lambda: simulate(tol=TOL, duration=DURATION, u=u), adaptive_loop(module, u=u),
+        ),
+        "`simulate(tol=, times=)`": (
+            lambda: simulate(tol=TOL, times=times), adaptive_loop(module, times),
+        ),
+        "`simulate_batch(steps=10)` of eight": (
+            lambda: batch(q, qd, steps=STEPS), batch_loop(module),
+        ),
+        "`simulate_batch(h=, u=, steps=10)` of eight": (
+            lambda: batch(q, qd, h=H, u=each, steps=STEPS), batch_loop(module, each),
+        ),
+    }  # fmt: skip
+
+
+def seconds(call: Callable[[], object]) -> float:
+    """Return the mean over many calls in a row, processor time, s."""
+    begun = time.thread_time()
+    for _ in range(MANY):
+        call()
+    return (time.thread_time() - begun) / MANY
+
+
+def overheads(root: Path, rounds: int) -> dict[str, tuple[float, float]]:
+    """Return by title the least time of a call and of its loop in C, s."""
+    text = (SCENES / "cartpole_driven.toml").read_text(encoding="utf-8")
+    (root / "driven.toml").write_text(text + "tolerance = 1e-9\nbatch = true\n", encoding="utf-8")
+    table = calls(eomc.load(root / "driven.toml", root))
+    best = dict.fromkeys(table, (math.inf, math.inf))
+    for _ in range(rounds + 1):
+        for title, (call, loop) in table.items():
+            whole, bare = best[title]
+            best[title] = min(whole, seconds(call)), min(bare, seconds(loop))
+    return best
+
+
+def batch_step(root: Path, rounds: int) -> float:
+    """Return the least time of a step of eight instances, s."""
     case = work.CASES["cart-pole"]
     module = work.load(case, root, "batch = true\n")
-    q, qd = (np.tile(x, (8, 1)) for x in case.x0.reshape(2, -1))
-    return quartiles([seconds(lambda: module.step_batch(q, qd, 1e-6), 300) for _ in range(rounds)])
+    q, qd = (np.tile(x, (COUNT, 1)) for x in case.x0.reshape(2, -1))
+    return min(seconds(lambda: module.step_batch(q, qd, 1e-6)) for _ in range(rounds))
 
 
-def import_time(root: Path, rounds: int) -> tuple[float, float, float]:
-    """Quartiles over the rounds of a warm import beyond NumPy's own, s."""
+def import_time(root: Path, rounds: int) -> float:
+    """Return the least time of a warm import beyond NumPy's own, s."""
     path = work.write(work.CASES["cart-pole"], root)
     eomc.load(path, path.parent)
     kept = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
     command = [sys.executable, "-c", IMPORT, str(path.parent)]
-    found = []
-    for _ in range(rounds + 1):
-        done = subprocess.run(command, env=kept, capture_output=True, text=True, check=True)
-        found.append(float(done.stdout))
-    return quartiles(found[1:])  # the first may have written the bytecode
-
-
-def said(root: Path, rounds: int) -> str:
-    """All as lines of a table, with their bars."""
-    lines = ["| | median | quartiles | bar |", "|---|---|---|---|"]
-    for title, unit, scale, bar, found in (
-        ("`simulate(steps=10)` beyond ten steps", "us", 1e6, CALL_BAR, call_overhead(root, rounds)),
-        (
-            "`simulate()` by a tolerance, beyond its loop in C",
-            "us", 1e6, FIT_BAR, adaptive_overhead(root, rounds),
-        ),
-        (
-            "the same with an input that is held",
-            "us", 1e6, FIT_BAR, adaptive_overhead(root, rounds, driven=True),
-        ),
-        ("`step_batch` of eight", "us", 1e6, math.inf, batch_call(root, rounds)),
-        (
-            "warm import of a built module, beyond NumPy's",
-            "ms", 1e3, IMPORT_BAR, import_time(root, min(rounds, 9)),
-        ),
-    ):  # fmt: skip
-        low, middle, high = (scale * x for x in found)
-        verdict = "met" if found[1] <= bar else "**missed**"
-        wanted = f"{scale * bar:g} {unit} {verdict}" if bar < math.inf else ""
-        lines.append(f"| {title} | {middle:.3g} {unit} | {low:.3g} – {high:.3g} | {wanted} |")
-    return "\n".join(lines) + "\n"
+    done = (
+        subprocess.run(command, env=kept, capture_output=True, text=True, check=True)
+        for _ in range(rounds + 1)  # the first may write the bytecode
+    )
+    return min(float(run.stdout) for run in done)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rounds", type=int, default=25)
-    options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as root:
-        print(said(Path(root), options.rounds), end="")
+    rounds = parser.parse_args().rounds
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        print("| call | whole, us | loop in C, us | overhead, us | bar |\n|---|---|---|---|---|")
+        for title, (whole, bare) in overheads(root, rounds).items():
+            verdict = "met" if whole - bare <= OVERHEAD_BAR else "**missed**"
+            numbers = " | ".join(f"{1e6 * x:.2f}" for x in (whole, bare, whole - bare))
+            print(f"| {title} | {numbers} | {1e6 * OVERHEAD_BAR:g} us {verdict} |")
+        print(f"| `step_batch` of eight | {1e6 * batch_step(root, rounds):.2f} | | | |")
+        spent = import_time(root, min(rounds, 9))
+        verdict = "met" if spent <= IMPORT_BAR else "**missed**"
+        print(f"\nwarm import beyond NumPy's: {1e3 * spent:.3g} ms, {1e3 * IMPORT_BAR:g} {verdict}")
 
 
 if __name__ == "__main__":

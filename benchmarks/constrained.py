@@ -31,7 +31,7 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 sys.path.insert(0, str(ROOT / "tests"))
 
-from constrained import cases, error_of, system  # noqa: E402  (of the tests)
+from support.constraint_cases import cases, error_of, system  # noqa: E402  (of the tests)
 
 import eomc  # noqa: E402
 from eomc import pipeline  # noqa: E402

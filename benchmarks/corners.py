@@ -2,11 +2,11 @@
 
     python benchmarks/corners.py
 
-Scenes of tests/corner_cases.py from 24 starts each: of the errors at the end, over the tolerance,
-the median and the largest, and the median of evaluations. Below that, what the watch costs where
-nothing bends: a pendulum whose drive never reaches its limits, beside the same without them; of 40
-runs in turns the least time. Then friction that is small beside the other forces, by the largest
-errors of 24 starts. Last, a steep smooth force in place of a jump.
+Scenes of tests/support/nonsmooth_cases.py from 24 starts each: of the errors at the end, over the
+tolerance, the median and the largest, and the median of evaluations. Below that, what the watch
+costs where nothing bends: a pendulum whose drive never reaches its limits, beside the same without
+them; of 40 runs in turns the least time. Then friction that is small beside the other forces, by
+the largest errors of 24 starts. Last, a steep smooth force in place of a jump.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
 
-from corner_cases import CASES, PENDULUM, RUBBED, rubbed  # noqa: E402
+from support.nonsmooth_cases import CASES, PENDULUM, RUBBED, rubbed  # noqa: E402
 
 import eomc  # noqa: E402
 

@@ -23,7 +23,7 @@ import numpy as np
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
 
-from cases import case_system, cases  # noqa: E402
+from support.cases import case_system, cases  # noqa: E402
 
 import eomc  # noqa: E402
 

@@ -28,12 +28,10 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 sys.path.insert(0, str(ROOT / "tests"))
 
-import cases  # noqa: E402  (of the tests)
-import constrained  # noqa: E402  (of the tests)
+from support import cases, constraint_cases  # noqa: E402  (of the tests)
 
 import eomc  # noqa: E402
-from eomc.model.from_scene import from_scene  # noqa: E402
-from eomc.model.system import System  # noqa: E402
+from eomc.model.system import System, from_scene  # noqa: E402
 from eomc.scene.read import parse  # noqa: E402
 
 LOW, HIGH = 1e-1, 1e-3  # errors that the library admits
@@ -130,14 +128,14 @@ def problems() -> Iterator[Problem]:
     ):
         case = FOUR_BARS.format(n)
         error = partial(along, case, True, outputs)
-        made, few = constrained.system(case), ("rk4", "dp8")
+        made, few = constraint_cases.system(case), ("rk4", "dp8")
         name = f"A02, N = {n}, {end:g} s"
         yield Problem(name, made, few, end, outputs, error, admitted, published, False)
-    made = constrained.system(SQUEEZER)
-    error = partial(at_end, SQUEEZER, constrained, 3)  # of five rows: 0.03 s
+    made = constraint_cases.system(SQUEEZER)
+    error = partial(at_end, SQUEEZER, constraint_cases, 3)  # of five rows: 0.03 s
     yield Problem("A03, 0.05 s", made, all_methods, 0.05, 5, error, high, "0.384 s")
-    made = constrained.system(CUBE)
-    error = partial(at_end, CUBE, constrained, -1)
+    made = constraint_cases.system(CUBE)
+    error = partial(at_end, CUBE, constraint_cases, -1)
     yield Problem("A04, 10 s", made, all_methods, 10.0, 1, error, high, "0.258 s")
     error = partial(at_end, GOVERNOR, cases, -1)
     stiff = ("gauss8", "gauss16")

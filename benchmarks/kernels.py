@@ -34,8 +34,8 @@ from sympy import S
 import eomc
 from eomc.derive import lagrange
 from eomc.derive.tape import Stage
-from eomc.emit import c_expression
-from eomc.emit.c_expression import CContext
+from eomc.emit.common import c_expression
+from eomc.emit.common.c_expression import CContext
 from eomc.program import program
 from eomc.program.ir import Call, Function, Operand
 from eomc.toolchain import compiler

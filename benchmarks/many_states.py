@@ -161,9 +161,8 @@ def runs(m: Any, states: int, table: Table) -> None:
     alone = {"one": m.simulate(u=u[0, 0], **single), "u": m.simulate(u=table_u, **single)}
 
     def column(run: Any, name: str) -> Any:
-        vars(run).pop("outputs", None)
-        if hasattr(run, "_energy"):
-            run._energy = None
+        for cached in ("outputs", "energy"):
+            vars(run).pop(cached, None)
         return getattr(run, name)
 
     for what, made, count in (

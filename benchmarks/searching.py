@@ -61,19 +61,17 @@ def adaptive_in_c(
 ) -> Callable[[], object]:
     """A run in steps that fit the tolerance: the loop in C, called with nothing around it."""
     model = model_of(module)
-    (address, real, null), work = model.c.tools, model.c.ffi.new("adaptive_work *")
-    start, nothing = np.concatenate(model.info.start), bytes(model.c.ffi.sizeof(work[0]))
-    x, t = start.copy(), np.zeros(1)
-    at_x, at_t, at_p = address(real, x), address(real, t), model.arguments.default_pointers[2]
-    at_u, memory, many = model.c.pointer(u), model.c.ffi.buffer(work), 2**40
+    ffi, pointer, null = model.c.ffi, model.c.pointer, model.c.null
+    options = ffi.new("run_options *", {"tol": tol, "t_end": end, "steps": 2**40})
+    output, nothing = ffi.new("run_output *"), bytes(ffi.sizeof("run_output"))
+    (q, qd, p), no_events = model.arguments.default_pointers, model.integrator.no_events
+    at_u, integrate = pointer(u), model.c.lib.integrate
 
     def run() -> None:
-        x[:] = start
-        t[0] = 0.0
-        memory[:] = nothing
-        model.c.lib.adaptive(
-            at_x, at_t, end, tol, 0.0, at_u, many, null, 0, null, null, null, at_p, work
-        )
+        ffi.memmove(output, nothing, len(nothing))
+        integrate(
+            options, output, null, q, qd, null, 0, at_u, 0, p, *no_events, null, null, null
+        )  # fmt: skip
 
     return run
 
@@ -81,13 +79,18 @@ def adaptive_in_c(
 def fixed_in_c(module: ModuleType, method: str, h: float, steps: int) -> Callable[[], object]:
     """A run in fixed steps, likewise; it keeps the start and the end."""
     model = model_of(module)
-    (address, real, null), loop = model.c.tools, model.integrator.loops[method][1]
+    null, no_events = model.c.null, model.integrator.no_events
+    options = model.c.ffi.new("run_options *", {"h": h, "steps": steps, "every": steps})
+    if len(model.info.methods) > 1:
+        options.method = model.info.methods.index(method)
+    if model.info.events:
+        options.ignores_events = True
     q0, qd0, p = model.arguments.default_pointers
     rows = np.empty((2, 2, model.info.nq))
-    to = address(real, rows)
+    to, integrate = model.c.pointer(rows), model.c.lib.integrate
 
     def run() -> Array:
-        loop(to, null, q0, qd0, 0.0, h, steps, null, 0, steps, p, null)
+        integrate(options, null, null, q0, qd0, null, 2, null, 0, p, *no_events, null, to, null)
         return rows
 
     return run

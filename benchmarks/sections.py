@@ -19,10 +19,10 @@ from typing import Any
 import heyoka
 import numpy as np
 from adaptive import LOOSEST, ROOT, TIGHTEST
-from cases import scene_text
 from machine import CORES, machine
 from scipy.integrate import solve_ivp
 from searching import Array
+from support.cases import scene_text
 from taylor import Options, Taylor
 
 import eomc

@@ -13,13 +13,13 @@ side are of functions of the Panda's bodies (bodies.py), a thousand calls at fif
 from __future__ import annotations
 
 import argparse
+import importlib
 import re
-import sys
 import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -34,9 +34,9 @@ import work
 
 import eomc
 from eomc.derive import link_multipliers
-from eomc.emit import adaptive, c_expression
-from eomc.emit.optimised import accelerations, files
-from eomc.emit.optimised.accelerations import Accelerations
+from eomc.emit.common import adaptive, c_expression
+from eomc.emit.optimised import files, lanes
+from eomc.emit.optimised.lanes import Accelerations
 from eomc.emit.optimised.steppers import Steppers
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
@@ -55,7 +55,7 @@ def without_two_points() -> Any:
 
 
 def without_registers() -> Any:
-    return patch.object(accelerations, "MIN_SIMD_ANGLES", 1000)
+    return patch.object(lanes, "MIN_SIMD_ANGLES", 1000)
 
 
 def without_multipliers() -> Any:
@@ -78,6 +78,23 @@ def with_lanes() -> Any:
 
 def without_exponentials() -> Any:
     return patch.object(files, "LANE_FUNCTIONS", frozenset())
+
+
+@contextmanager
+def without_short_calls(package: str = "eomc.runtime") -> Iterator[None]:
+    """Check all arguments in each call, and make runs by the general loop.
+
+    package: the runtime, of which each built module has a copy.
+    """
+    modules = [
+        importlib.import_module(f"{package}.{name}") for name in ("integrator", "integration")
+    ]
+    with ExitStack() as stack:
+        for module in modules:
+            stack.enter_context(patch.object(module, "run_at_once", return_value=None))
+        plain = modules[0].PlainSteps
+        stack.enter_context(patch.object(plain, "find", return_value=None))
+        yield
 
 
 def with_friction(case: work.Case, names: Sequence[str]) -> work.Case:
@@ -274,7 +291,7 @@ def gauss16(rounds: int) -> Iterator[str]:
 
 
 def calls(rounds: int) -> Iterator[str]:
-    """A thousand short runs, with the short ways of `simulate` and without."""
+    """A thousand short runs, with the short calls of C and without."""
     case, extra = work.CASES["cart-pole"], "tolerance = 1e-9\n"
     ways: dict[str, dict[str, float]] = {
         "simulate(steps=10)": {"steps": 10, "h": 0.005}, "simulate() of 0.5 s": {"duration": 0.5}
@@ -282,18 +299,15 @@ def calls(rounds: int) -> Iterator[str]:
     with (
         built(case, nullcontext(), extra, "with_calls") as full,
         built(case, nullcontext(), extra, "without_calls") as less,
+        without_short_calls(f"{less.__name__}._runtime"),
     ):
-        loops = less._model.integrator.loops  # the third: up to how many steps there is one
-        loops |= {name: (*loop[:2], -1, *loop[3:]) for name, loop in loops.items()}
-        runtime = sys.modules[f"{less.__name__}._runtime.adaptive"]
-        with patch.object(runtime, "simulate_short_run", return_value=None):
-            for name, how in ways.items():
-                one, other = (m.simulate(**how).q for m in (less, full))
-                if not np.array_equal(one, other):
-                    raise SystemExit(f"short ways of calls, {name}: runs differ")
-                jobs = [lambda m=m, how=how: [m.simulate(**how) for _ in range(1000)]
-                        for m in (less, full)]  # fmt: skip
-                yield f"| short ways of calls | {name}, cart-pole | {ratio(*jobs, rounds):.2f} |"
+        for name, how in ways.items():
+            one, other = (m.simulate(**how).q for m in (less, full))
+            if not np.array_equal(one, other):
+                raise SystemExit(f"short calls, {name}: runs differ")
+            jobs = [lambda m=m, how=how: [m.simulate(**how) for _ in range(1000)]
+                    for m in (less, full)]  # fmt: skip
+            yield f"| short calls | {name}, cart-pole | {ratio(*jobs, rounds):.2f} |"
 
 
 def main() -> None:

@@ -18,8 +18,7 @@ import time
 import sympy
 
 from eomc.derive import lagrange
-from eomc.model.from_scene import from_scene
-from eomc.model.system import System
+from eomc.model.system import System, from_scene
 from eomc.program import program
 from eomc.scene import read as scene
 from eomc.verify import symbolic

@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager
 from types import ModuleType
 
 import pytest
-from conftest import ROOT
+from support.session import ROOT
 
 
 @pytest.fixture
@@ -21,7 +21,7 @@ def tricks(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     module = importlib.import_module("tricks")
     for name in set(sys.modules) - known:
         if str(getattr(sys.modules[name], "__file__", "")).startswith(str(ROOT / "benchmarks")):
-            monkeypatch.delitem(sys.modules, name)
+            del sys.modules[name]
     return module
 
 

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import ROOT, needs
+from support.session import ROOT, needs
 
 pytestmark = pytest.mark.slow
 PAGE = (ROOT / "docs" / "embedding.md").read_text(encoding="utf-8")

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from support.session import ROOT
 
 pytestmark = pytest.mark.usefixtures("unoptimised_file")
 EXAMPLES = ROOT / "docs" / "examples"

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from conftest import ROOT, needs
-from fmus import plain
+from support.fmus import plain
+from support.session import ROOT, needs
 
 from eomc.cli.main import main
 

@@ -8,8 +8,8 @@ import subprocess
 import tomllib
 from pathlib import Path
 
-from cases import SCENES
-from conftest import MODULES, needs
+from support.cases import SCENES
+from support.session import MODULES, needs
 
 import eomc
 

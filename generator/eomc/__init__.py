@@ -5,13 +5,20 @@
 `load` goes the whole way, `sources` stops at the text; pipeline.py shows each step.
 """
 
+from typing import TYPE_CHECKING
+
 from eomc.base.errors import EomcError, SceneError
 from eomc.base.resources import __version__
 from eomc.pipeline import build, export_fmu, load, read, sources
 
+if TYPE_CHECKING:
+    from eomc.model.system import System, dot
+    from eomc.report.equations import equations
+    from eomc.sweeps.sweep import sweep
+
 __all__ = [
     "EomcError", "SceneError", "System", "__version__", "build", "dot", "equations", "export_fmu",
-    "load", "read", "sources",
+    "load", "read", "sources", "sweep",
 ]  # fmt: skip
 
 
@@ -21,7 +28,7 @@ def __dir__() -> list[str]:
 
 
 def __getattr__(name: str) -> object:
-    """Import System, dot or equations on first use, since importing SymPy takes half a second."""
+    """Import System, dot, equations or sweep on first use: SymPy alone takes half a second."""
     if name in ("System", "dot"):
         from eomc.model import system
 
@@ -30,4 +37,8 @@ def __getattr__(name: str) -> object:
         from eomc.report.equations import equations
 
         return equations
+    if name == "sweep":
+        from eomc.sweeps.sweep import sweep
+
+        return sweep
     raise AttributeError(f"module 'eomc' has no attribute {name!r}")

@@ -3,7 +3,7 @@
     scene.toml -> Scene -> System -> Equations -> Program -> Sources -> Module
 
 `load` runs all stages; `sources` stops at the text. The arrows are the functions scene.read.read,
-model.from_scene.from_scene, derive.lagrange.derive, program.program.build, emit.render.render and
+model.system.from_scene, derive.lagrange.derive, program.program.build, emit.render.render and
 toolchain.cache.build.
 """
 
@@ -23,7 +23,7 @@ from eomc.runtime.package import model_of
 
 if TYPE_CHECKING:
     from eomc.base.errors import Problem, SceneError
-    from eomc.emit.fmu.unit import Unit
+    from eomc.emit.fmu import Unit
     from eomc.emit.render import Sources
     from eomc.model.system import System
     from eomc.program.program import Program
@@ -58,7 +58,7 @@ def read(scene: ScenePath) -> System:
     constraints, initial values that are not fixed are adjusted to satisfy them. Raises SceneError,
     which lists all problems of the scene, if the scene is invalid.
     """
-    from eomc.model.from_scene import from_scene
+    from eomc.model.system import from_scene
     from eomc.scene import read as scenes
 
     _refuse_other(scene, "")
@@ -71,7 +71,7 @@ def assemble(system: System) -> System:
     """Return a system with initial values that satisfy its constraints, if it has any."""
     if not system.constraints:
         return system
-    from eomc.program import assembly
+    from eomc.mechanism import assembly
 
     return assembly.assembled(system)
 
@@ -350,7 +350,7 @@ def with_events(model: Any, events: Mapping[str, Any], folder: Path) -> ModuleTy
     name, source, what = model.info.name, model.source, "simulate(events=)"
     if source is None:
         raise EomcError(f"{what}: {name} was imported without its scene: load it with eomc.load")
-    if not isinstance(source, Path) and source.scene and read(source.file) == source:
+    if not isinstance(source, Path) and source.file and read(source.file) == source:
         source = Path(source.file)
     if not isinstance(source, Path):
         system = _add_events(source, events, what)
@@ -394,10 +394,7 @@ def _add_events(system: System, events: Mapping[str, Any], what: str) -> System:
         extended: System = system.again(events={**own, **events})
         return extended
     except SceneError as wrong:
-        problems = [replace(p, file=what) for p in _name_events(wrong, len(own), events).problems]
-        raise SceneError(problems) from None
-    except EomcError as wrong:
-        raise EomcError(str(wrong).replace("System.make:", f"{what}:")) from None
+        raise SceneError([replace(p, file=what) for p in wrong.problems]) from None
 
 
 def _name_events(wrong: SceneError, own: int, events: Mapping[str, Any]) -> SceneError:
@@ -429,7 +426,7 @@ def name_and_digest(path: Path) -> tuple[str, str]:
 
     try:
         tree, digest = tree_and_digest(path)
-    except (OSError, ValueError):
+    except (OSError, EomcError):
         return "", ""  # the reader says what is wrong
     name = tree.get("name", "")
     return name if isinstance(name, str) and name.isidentifier() else "", digest

@@ -6,6 +6,7 @@ Text on terminals, in pages and in figures: test_texts_shown.py.
 from __future__ import annotations
 
 import ast
+import dataclasses
 import json
 import os
 import re
@@ -14,7 +15,7 @@ import sys
 import tomllib
 import unicodedata
 from collections.abc import Iterator
-from dataclasses import is_dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,8 +23,7 @@ from typing import Any
 import jinja2
 import pytest
 import sympy
-from conftest import needs, tiers
-from payloads import (
+from support.payloads import (
     FEW,
     ORDINARY,
     PAYLOADS,
@@ -39,16 +39,14 @@ from payloads import (
     tokens,
     with_texts,
 )
+from support.session import needs, tiers
 
 import eomc
 from eomc.base import texts
 from eomc.base.errors import EomcError, SceneError
-from eomc.emit import embedding, package, portable, render, selftest
-from eomc.emit.c_expression import DOUBLE
-from eomc.emit.c_names import Target
-from eomc.emit.optimised import files
-from eomc.model.from_scene import from_scene
-from eomc.model.system import System
+from eomc.emit import render
+from eomc.emit.common import templates
+from eomc.model.system import System, from_scene
 from eomc.report import equations_text
 from eomc.report.equations_text import write_equations
 from eomc.scene import schema
@@ -92,13 +90,16 @@ def should_be_refused(text: str, lines: bool) -> bool:
 
 def test_every_free_text_field_of_a_scene_is_tested() -> None:
     """A new table must not be forgotten here; tables of one model count as one."""
-    checked = (texts.checked_line, texts.checked_lines)
-    models = {"": schema.Document, **schema._MODELS}
+    models: dict[str, Any] = {"": schema.Document} | {
+        f.name: model
+        for f in dataclasses.fields(schema.Document)
+        if (model := f.metadata.get("table") or f.metadata.get("tables"))
+    }
     known = {
-        (model, name)
+        (model, f.name)
         for model in models.values()
-        for name, field in model.model_fields.items()
-        if any(getattr(rule, "func", None) in checked for rule in field.metadata)
+        for f in dataclasses.fields(model)
+        if f.metadata.get("check") in (schema.line, schema.note)
     }
     paths = (key.split(".") for _, key in fields())
     tested = {(models[path[0] if len(path) > 1 else ""], path[-1]) for path in paths}
@@ -229,7 +230,7 @@ def test_ordinary_text_is_written_unchanged(tmp_path: Path) -> None:
 
 
 def strings(value: Any) -> Iterator[str]:
-    """Yield all strings in the value that a template receives."""
+    """Yield all strings in a value and in the containers in it."""
     if isinstance(value, str):
         yield value
     elif isinstance(value, dict):
@@ -239,27 +240,29 @@ def strings(value: Any) -> Iterator[str]:
     elif isinstance(value, (list, tuple, set)):
         for each in value:
             yield from strings(each)
-    elif is_dataclass(value) and not isinstance(value, texts.FreeText):
-        for each in vars(value).values():
-            yield from strings(each)
 
 
-def test_templates_receive_free_text_only_as_free_text() -> None:
+def test_templates_read_free_text_only_as_free_text(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every attribute that a template reads, and every result of a call, is recorded."""
+    values: list[Any] = []
+    read_attribute, call = templates.Environment.getattr, jinja2.runtime.Context.call
+
+    def getattr_(self: templates.Environment, obj: Any, attribute: str) -> Any:
+        value = read_attribute(self, obj, attribute)
+        values.extend([] if isinstance(obj, texts.FreeText) else [value])
+        return value
+
+    def call_(self: Any, *arguments: Any, **passed: Any) -> Any:
+        values.append(call(self, *arguments, **passed))
+        return values[-1]
+
+    monkeypatch.setattr(templates.Environment, "getattr", getattr_)
+    monkeypatch.setattr(jinja2.runtime.Context, "call", call_)
     model = derived()
     marked = replace(model, system=with_texts(model.system, "MARKED"))
-    target = Target(marked, DOUBLE)
-    views: list[Any] = [embedding.main_view(target), package.face_view(target, "_x")]
-    views += [package.binding_view(target), selftest.selftest_view(target)]
-
-    def show(view: Any) -> str:
-        views.append(view)
-        return ""
-
-    portable.files(marked, show)
-    files.files(files.steppers(target), show)
-    assert len(views) > 12
-    for view in views:
-        assert not [s for s in strings(view) if "MARKED" in s], type(view)
+    rendered = [render.render(marked, "_x").files["main.c"], render.unit(marked, 2).files]
+    assert "MARKED" in str(rendered) and len(values) > 1000
+    assert not [s for s in strings(values) if "MARKED" in s]
 
 
 def test_printing_free_text_without_escape_raises() -> None:
@@ -267,7 +270,7 @@ def test_printing_free_text_without_escape_raises() -> None:
     for print_it in (str, "{}".format, lambda x: f"{x}", lambda x: "".join(map(str, [x]))):
         with pytest.raises(TypeError, match="free text"):
             print_it(text)
-    environment = render.environment()
+    environment = templates.environment()
     for template in ("{{ x }}", "{{ 'a' ~ x }}", "{{ [x, x] | join }}"):
         with pytest.raises(TypeError, match="free text"):
             environment.from_string(template).render(x=text)
@@ -371,7 +374,7 @@ def test_titles_and_units_must_be_strings() -> None:
             return f"__import__('os').system({TOUCH!r})"
 
     for wrong in (3, None, b"x", sympy.Symbol("x")):
-        with pytest.raises(EomcError, match="a title or unit is a text"):
+        with pytest.raises(EomcError, match=r"units\.x: must be text, here"):
             System.make("made", [x], v**2, title="x", units={x: wrong})  # type: ignore[dict-item]
     system = System.make("made", [x], v**2, title=Odd("x"), units={x: Odd("y")})
     module_text = eomc.sources(system).files["__init__.py"]

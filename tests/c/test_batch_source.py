@@ -10,13 +10,13 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from cases import SCENES, fast_kit
-from compilers import compiled
-from conftest import EVERYTHING, needs, tiers
-from corner_cases import CASES
+from support.cases import SCENES, fast_kit
+from support.compilation import compiled
+from support.nonsmooth_cases import CASES
+from support.session import EVERYTHING, needs, tiers
 
 import eomc
-from eomc.model.from_scene import from_scene
+from eomc.model.system import from_scene
 from eomc.scene.read import parse
 from eomc.toolchain.files import write_files
 
@@ -29,9 +29,10 @@ def test_batch_of_zero_instances_reads_no_memory(tmp_path: Path) -> None:
     )
     for file, source in fast_kit(eomc.sources(eomc.read(tmp_path / "cartpole.toml"))).items():
         (tmp_path / file).write_text(source, encoding="utf-8")
-    call = "cartpole_rk4_batch(0, 0, 0, 0.01, 0, 5, 0, 0, 0, 0, 0, 1, 0, 0);"
+    call = "return cartpole_integrate_batch(0, 0, 0, 0, &options, 0);"
+    options = "cartpole_options options = { .h = 0.01, .steps = 5, .p_instance = 1 };"
     (tmp_path / "none.c").write_text(
-        f'#include "cartpole.h"\nint main(void)\n{{\n    {call}\n    return 0;\n}}\n',
+        f'#include "cartpole.h"\nint main(void)\n{{\n    {options}\n    {call}\n}}\n',
         encoding="utf-8",
     )
     subprocess.run(

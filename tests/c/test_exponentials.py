@@ -12,12 +12,11 @@ import mpmath
 import numpy as np
 import pytest
 import sympy
-from conftest import ROOT, tiers
-from lane_source import BUILDS, EXPONENTIALS, MOST, VECTORS, built, of_lane
-from sincos_bench import bench
+from support.lanes import BUILDS, EXPONENTIALS, MOST, VECTORS, bench, built, of_lane
+from support.session import ROOT, tiers
 
 import eomc
-from eomc.model.from_scene import from_scene
+from eomc.model.system import from_scene
 from eomc.scene.read import parse
 
 pytestmark = pytest.mark.skipif(shutil.which(bench.compiler()) is None, reason="no C compiler")

@@ -7,11 +7,11 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from cases import fast_kit
-from conftest import ROOT, needs, tiers
+from support.cases import fast_kit
+from support.session import ROOT, needs, tiers
 
 import eomc
-from eomc.model import from_scene as system
+from eomc.model import system
 from eomc.scene import read as scene
 from eomc.toolchain.files import write_files
 

@@ -17,7 +17,7 @@ import pytest
 
 import eomc
 from eomc.base import resources
-from eomc.model.from_scene import from_scene
+from eomc.model.system import from_scene
 from eomc.scene.read import parse
 
 GOLDEN = Path(__file__).parent / "golden"

@@ -11,9 +11,20 @@ from typing import Any
 import mpmath
 import numpy as np
 import pytest
-from conftest import ROOT, tiers
-from lane_source import BUILDS, EXPONENTIALS, LANES, MOST, VECTORS, built, call, of_lane
-from sincos_bench import LARGEST_ERROR, bench, nearest_multiples
+from support.lanes import (
+    BUILDS,
+    EXPONENTIALS,
+    LANES,
+    LARGEST_ERROR,
+    MOST,
+    VECTORS,
+    bench,
+    built,
+    call,
+    nearest_multiples,
+    of_lane,
+)
+from support.session import ROOT, tiers
 
 from eomc.emit.optimised.lanes import interleaved_index
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 
 import pytest
-from cases import SCENES
-from conftest import tiers
+from support.cases import SCENES
+from support.session import tiers
 
 import eomc
 from eomc import pipeline
-from eomc.emit import c_function
-from eomc.model.from_scene import from_scene
+from eomc.emit.common import c_function
+from eomc.model.system import from_scene
 from eomc.scene.read import parse
 
 

@@ -17,11 +17,11 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from cases import SCENES
-from conftest import ROOT, needs
+from support.cases import SCENES
+from support.session import ROOT, needs
 
 import eomc
-from eomc.model.from_scene import from_scene
+from eomc.model.system import from_scene
 from eomc.scene.read import parse
 from eomc.toolchain import sizes
 from eomc.toolchain.compiler import Compiler

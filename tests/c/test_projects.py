@@ -9,10 +9,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from cases import SCENES
 from click.testing import CliRunner, Result
-from compilers import STRICT, compiled, run
-from conftest import needs
+from support.cases import SCENES
+from support.compilation import STRICT, compiled, run
+from support.session import needs
 
 from eomc import pipeline
 from eomc.cli.main import main

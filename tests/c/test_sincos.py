@@ -14,8 +14,8 @@ from typing import Any
 import mpmath
 import numpy as np
 import pytest
-from conftest import needs, tiers
-from sincos_bench import LARGEST_ERROR, bench, nearest_multiples
+from support.lanes import LARGEST_ERROR, bench, nearest_multiples
+from support.session import needs, tiers
 
 pytestmark = pytest.mark.skipif(shutil.which(bench.compiler()) is None, reason="no C compiler")
 

@@ -14,14 +14,14 @@ from pathlib import Path
 
 import pytest
 from c.test_plain import NAMES, VARIANTS, assembled_system, generated, kit
-from cases import SCENES
-from compilers import STRICT, clang, compiled, run
-from conftest import ROOT, needs, tiers
-from executed import RICH
+from support.cases import SCENES
+from support.compilation import MATHEMATICS, STRICT, clang, compiled, run
+from support.generator_mutants import RICH
+from support.session import ROOT, needs, tiers
 
 import eomc
 from eomc.base.errors import EomcError
-from eomc.model import from_scene as system
+from eomc.model import system
 from eomc.scene import read as scene
 from eomc.toolchain import compiler, sizes
 
@@ -29,11 +29,7 @@ pytestmark = pytest.mark.usefixtures("quickly_compiled")
 LEVELS = ("-O0", "-O1", "-O2", "-O3", "-Os")
 C, CPP = ("c99", "c11", "c17"), ("c++11", "c++14", "c++17", "c++20")
 MOST = ["cartpole", "everything", "steppers", "driven", "single", "verlet", "chain", "rod"]
-MATHEMATICS = set(
-    """sin cos sincos tan asin acos atan atan2 sinh cosh tanh exp log sqrt pow fabs fmin
-    fmax""".split()
-)
-MATHEMATICS |= {f"{name}f" for name in MATHEMATICS}  # single precision
+FUNCTIONS = MATHEMATICS | {f"{name}f" for name in MATHEMATICS}  # also of single precision
 
 
 @pytest.mark.slow
@@ -151,16 +147,14 @@ def test_object_has_bounded_stack_and_no_writable_data(
     public = [f for f in measurement.functions if "." not in f.name]
     assert {
         f"{title}_acceleration",
-        f"{title}_{assembled_system(name).run.methods[0]}_run",
+        f"{title}_integrate",
     } <= names
     assert all(f.code > 0 and f.stack is not None and f.total_stack is not None for f in public)
     called = {x for f in measurement.functions for x in f.calls} - names
-    assert called <= MATHEMATICS | {"memcpy", "memset", "memmove"}, called - MATHEMATICS
+    assert called <= FUNCTIONS | {"memcpy", "memset", "memmove"}, called - FUNCTIONS
     run_of, step_of = (
-        next(
-            f for f in public if f.name == f"{title}_{assembled_system(name).run.methods[0]}_{what}"
-        )
-        for what in ("run", "step")
+        next(f for f in public if f.name == f"{title}_{what}")
+        for what in ("integrate", f"{assembled_system(name).run.methods[0]}_step")
     )
     assert run_of.total_stack is not None and step_of.total_stack is not None
     if level == "-O0":  # without inlining

@@ -10,10 +10,10 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from cases import SCENES
 from click.testing import CliRunner
-from conftest import ROOT
-from fmus import needs_fmpy
+from support.cases import SCENES
+from support.fmus import needs_fmpy
+from support.session import ROOT
 
 import eomc
 from eomc.base.errors import EomcError

@@ -11,13 +11,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from cases import SCENES
 from click.testing import CliRunner, Result
+from support.cases import SCENES
 
 from eomc import pipeline
 from eomc.cli.main import main
 from eomc.verify import check
-from eomc.verify.report import CheckReport, CheckResult
+from eomc.verify.comparison import CheckReport, CheckResult
 
 
 @pytest.fixture

@@ -20,11 +20,10 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import pytest
-from cases import SCENES
 from click.testing import CliRunner
-from conftest import tiers
-from markupsafe import Markup
-from payloads import (
+from support.cases import SCENES
+from support.fake_module import FakeRun
+from support.payloads import (
     PAYLOADS,
     PLAIN,
     RAW,
@@ -35,11 +34,13 @@ from payloads import (
     tokens,
     with_texts,
 )
+from support.session import tiers
 
 import eomc
 from eomc.base import texts
 from eomc.cli import build, terminal
 from eomc.cli.main import main
+from eomc.model.system import System
 from eomc.report import cost_of_digits, page, plot
 from eomc.scene import read as scene
 from eomc.toolchain.cache import Built
@@ -71,8 +72,7 @@ class Tags(HTMLParser):
 
 @pytest.mark.slow
 def test_report_page_escapes_titles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # figures without text
-    monkeypatch.setattr(page, "_svg", lambda draw, size: Markup("<svg></svg>"))
+    monkeypatch.setattr(page, "without_pictures", lambda: "no pictures")
     measured = cost_of_digits.measure(
         derived().system, tmp_path, longest=0.002, methods=("rk4", "dp8")
     )
@@ -87,7 +87,7 @@ def test_report_page_escapes_titles(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 def figure_with(title: str, unit: str) -> Any:
     system = with_texts(derived().system, unit)
-    return plot.make_figure(replace(system, title=title), curves())
+    return plot.make_figure(replace(system, title=title), curves(system))
 
 
 @pytest.mark.slow
@@ -96,15 +96,16 @@ def test_figures_with_hostile_texts_are_valid_svg(name: str, tmp_path: Path) -> 
     text = PAYLOADS[name]
     figure_with(text, text).savefig(tmp_path / "figure.svg")
     system = with_texts(derived().system, text)
-    plot.write_figure(system, curves(), tmp_path / "drawn.svg", title=text)
+    plot.write_figure(system, curves(system), tmp_path / "drawn.svg", title=text)
     for file in ("figure.svg", "drawn.svg"):
         ElementTree.parse(tmp_path / file)
 
 
-def curves() -> plot.RunCurves:
+def curves(system: System) -> FakeRun:
     t = np.linspace(0, 1, 11)
     q = np.cos(t)[:, None]
-    return plot.RunCurves(t, q, q, 5 + 0 * t)
+    others = {x.name: t for x in (*system.inputs, *system.outputs)}
+    return FakeRun(system, t, q, q, 5 + 0 * t, others=others)
 
 
 def test_figure_text_is_not_read_as_mathematics_or_latex() -> None:

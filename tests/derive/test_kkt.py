@@ -12,7 +12,7 @@ from eomc.derive.constraints import _pivot_limit
 from eomc.derive.lagrange import derive
 from eomc.model.symbols import symbol
 from eomc.model.system import Constraint, System
-from eomc.program.interpret import evaluator
+from eomc.program.ir import evaluator
 from eomc.program.program import Program, build, matrix
 
 

@@ -11,27 +11,25 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-import links
 import numpy as np
 import pytest
 import sympy
-from cases import scene_system
-from conftest import tiers
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support import point_masses
+from support.cases import scene_system
+from support.session import tiers
 
 from eomc.base.errors import EomcError, SceneError
 from eomc.derive.lagrange import derive
 from eomc.derive.ldl import Solution
-from eomc.model.from_scene import from_scene
-from eomc.model.system import System, dot, symbol, t
+from eomc.model.system import System, dot, from_scene, symbol, t
 from eomc.program import program
-from eomc.program.interpret import evaluate
-from eomc.program.ir import Call
+from eomc.program.ir import Call, evaluate
 from eomc.program.program import Program
 from eomc.program.routes import RouteInputs
 from eomc.scene.read import parse
-from eomc.verify import check
+from eomc.verify.sampling import VALUES as QUANTITIES
 from eomc.verify.symbolic import SymbolicReference
 from eomc.verify.symbolic import derive as plainly
 
@@ -46,7 +44,7 @@ U = symbol("u")  # an input
 NAMES = ("x", "theta", "phi")
 
 # the name of a value in the program and in the reference
-VALUES = {**check.VALUES, "signal": "signals"}
+VALUES = {**QUANTITIES, "signal": "signals"}
 
 
 # --- random systems ------------------------------------------------------------------------------
@@ -124,7 +122,7 @@ def build_program(system: System) -> Program:
     return program.build(derive(system))
 
 
-states = partial(links.states, seed=5)
+states = partial(point_masses.states, seed=5)
 
 
 def reference_value(
@@ -344,7 +342,7 @@ def test_kinetic_energy_that_simplifies_to_a_quadratic_is_accepted() -> None:
     [sympy.S.Zero, v**2 / 2, v**2 / 2 + sympy.sin(x) * w, v**2 / 2 + y**2],
 )
 def test_coordinate_without_inertia_is_refused(kinetic: sympy.Expr) -> None:
-    with pytest.raises(EomcError, match="has no inertia") as error:
+    with pytest.raises(EomcError, match=r"has no inertia|nothing has inertia") as error:
         build_program(System.make("light", [x, y], kinetic, x**2 + y**2))
     assert "'y'" in str(error.value) or kinetic == 0
     assert ("write y_dot**2" in str(error.value)) == kinetic.has(w)

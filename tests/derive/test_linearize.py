@@ -7,31 +7,36 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cases import SCENES, variant
-from conftest import MODULES, Modules, tiers
+from support import point_masses
+from support.cases import SCENES, variant
+from support.session import MODULES, Modules, tiers
 
 import eomc
-from eomc.model.from_scene import from_scene
+from eomc.derive import lagrange
+from eomc.model.system import from_scene
+from eomc.program import program
+from eomc.runtime.package import model_of
 from eomc.scene.read import parse
-from eomc.verify import checks_inputs_outputs
+from eomc.verify import outputs
 from eomc.verify.comparison import Comparison
 
 
 def linearization(m: ModuleType, q: Any, qd: Any, t: float = 0.0, u: Any = None) -> list[Any]:
     """Return [A_q, A_qd, B] at one state from the C function."""
-    model: Any = m._model
+    model: Any = model_of(m)
     n, nu = len(m.coordinates), len(m.inputs)
-    matrices = [np.full((n, k), np.nan, m.dtype) for k in (n, n, nu)]
+    A, B = (np.full((2 * n, k), np.nan, m.dtype) for k in (2 * n, nu))
     inputs = None if u is None else np.ascontiguousarray(u, m.dtype)
     state = [np.ascontiguousarray(x, m.dtype) for x in (q, qd)]
     result = model.c.lib.linearization(
-        1, *map(model.c.pointer, matrices), *map(model.c.pointer, state), t,
+        1, *map(model.c.pointer, (A, B)), *map(model.c.pointer, state), t,
         model.c.pointer(inputs), model.c.pointer(model.info.p0), model.c.tools[2],
     )  # fmt: skip
     assert result >> 3 == 1 - (result & 7 != 0)
     if result & 7:
         raise ValueError(result & 7)
-    return matrices
+    assert np.array_equal(A[:n], np.eye(2 * n)[n:]) and not B[:n].any()
+    return [A[n:, :n], A[n:, n:], B[n:]]
 
 
 def differences(m: ModuleType, q: Any, qd: Any, t: float, u: Any) -> list[Any]:
@@ -116,7 +121,7 @@ def test_linearize_is_the_derivative_of_the_acceleration() -> None:
 def test_long_chain_is_linearized_by_columns() -> None:
     path = variant("chain", "lin_long", method='["rk4", "dp8", "gauss8"]')
     text = path.read_text(encoding="utf-8")
-    path.write_text(text.replace("n = { value = 5,", "n = { value = 9,"), encoding="utf-8")
+    path.write_text(text.replace("n = { value = 5,", "n = { value = 16,"), encoding="utf-8")
     m = eomc.load(path, MODULES)
     source = (MODULES / "lin_long" / "fast" / "lin_long.c").read_text(encoding="utf-8")
     assert "lin_long_slopes_column" in source
@@ -126,6 +131,13 @@ def test_long_chain_is_linearized_by_columns() -> None:
         assert np.max(np.abs(one - other), initial=0.0) < 1e-7 * np.max(np.abs(other), initial=1.0)
     ends = [m.simulate(h=0.01, duration=0.5, method=name).q[-1] for name in ("dp8", "gauss8")]
     assert np.max(np.abs(ends[0] - ends[1])) < 1e-9
+
+
+def test_columns_of_a_chain_share_their_operations() -> None:
+    text = point_masses.links([*range(-1, 7)], equal=False) + "\n[run]\nlinearize = true\n"
+    functions = program.build(lagrange.derive(point_masses.read_system(text))).functions
+    # 16 columns computed one by one take 16 times the acceleration or more
+    assert functions["linearization"].cost.flops <= 6.5 * functions["acceleration"].cost.flops
 
 
 def test_linearization_is_emitted_only_on_request() -> None:
@@ -272,7 +284,5 @@ def test_check_detects_a_wrong_closed_loop(modules: Modules) -> None:
     m, system = modules.unoptimised(LOOP), from_scene(parse(LOOP, "test.toml"))
     for module, passed in ((m, True), (WrongClosedLoop(), False)):
         comparison = Comparison(system, module, np.random.default_rng(0), 4)
-        checks_inputs_outputs.report_closed_loop(comparison)
-        assert [(row.name, row.passed) for row in comparison.results] == [
-            ("closed loop", passed)
-        ], comparison.results
+        results = comparison.report(outputs.closed_loop_checks)
+        assert [(row.name, row.passed) for row in results] == [("closed loop", passed)], results

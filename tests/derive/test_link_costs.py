@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import sympy
-from cases import scene_system
-from conftest import Modules, tiers
-from links import (
+from support.cases import scene_system
+from support.point_masses import (
     A_DOT,
     B_DOT,
     CHAIN,
@@ -31,11 +30,11 @@ from links import (
     x,
     y,
 )
+from support.session import Modules, tiers
 
 from eomc.derive import ldl, link_multipliers
 from eomc.model.system import System, dot
-from eomc.program.interpret import evaluate
-from eomc.program.ir import Call
+from eomc.program.ir import Call, evaluate
 
 EPS = 2.0**-52
 

@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-import trees
-from conftest import tiers
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from links import (
+from support import trees
+from support.point_masses import (
     A_DOT,
     B_DOT,
     C_DOT,
@@ -39,12 +38,12 @@ from links import (
     x,
     y,
 )
+from support.session import tiers
 
 from eomc.derive import lagrange
 from eomc.derive.ldl import Solution
 from eomc.model.system import System, dot, t
-from eomc.program.interpret import evaluate
-from eomc.program.ir import Function
+from eomc.program.ir import Function, evaluate
 from eomc.program.lower import lower
 
 EPS = 2.0**-52

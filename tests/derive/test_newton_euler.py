@@ -10,29 +10,26 @@ from collections.abc import Callable, Mapping
 from functools import cache, partial
 from typing import Any
 
-import links
 import numpy as np
 import pytest
-import trees
-from conftest import tiers
 from hypothesis import HealthCheck, Phase, given, note, settings
 from hypothesis import strategies as st
+from support import point_masses, trees
+from support.session import tiers
 
 from eomc.base.errors import EomcError
 from eomc.derive import lagrange
-from eomc.derive.links import Vectors
-from eomc.derive.newton_euler import TreeDynamics
-from eomc.model.from_scene import from_scene
+from eomc.derive.newton_euler import TreeDynamics, Vectors
 from eomc.model.symbols import ALONG
-from eomc.model.system import System
+from eomc.model.system import System, from_scene
 from eomc.program import program
-from eomc.program.interpret import evaluate
-from eomc.program.ir import Function
+from eomc.program.ir import Function, evaluate
 from eomc.program.program import Program
 from eomc.program.routes import RouteInputs
 from eomc.scene.read import parse
-from eomc.verify import check, symbolic
+from eomc.verify import symbolic
 from eomc.verify.reference import ReferenceModel
+from eomc.verify.sampling import VALUES as QUANTITIES
 from eomc.verify.taylor import TaylorReference
 
 FEW = settings(
@@ -41,7 +38,7 @@ FEW = settings(
 )  # fmt: skip
 MANY = settings(FEW, max_examples=25)
 
-VALUES = {**check.VALUES, "signal": "signals"}  # names in the program and in the reference
+VALUES = {**QUANTITIES, "signal": "signals"}  # names in the program and in the reference
 EPS = 2.0**-52
 WORST = 1e5  # condition of D beyond which rounding alone may cause an error of 1e-9
 
@@ -90,7 +87,7 @@ def every_route(
 # --- states and what is asked there ---------------------------------------------------------------
 
 
-states = partial(links.states, count=2, seed=7, reach=1.2)
+states = partial(point_masses.states, count=2, seed=7, reach=1.2)
 
 
 class ReferenceState:
@@ -320,7 +317,7 @@ def test_joint_without_inertia_is_refused_by_name() -> None:
         build_program(system)
 
 
-@pytest.mark.parametrize("count", [3, 9])  # by Lagrange too; by Newton and Euler only
+@pytest.mark.parametrize("count", tiers([3, 9], 3))  # by Lagrange too; by Newton and Euler only
 @pytest.mark.parametrize(
     ("joint", "axes", "dependent"),
     [
@@ -468,7 +465,7 @@ def test_grouped_inertias_save_flops_and_preserve_the_motion(
     system = system_from(trees.arm(3))
     grouped = every_route(system, accelerations)
     monkeypatch.setattr(
-        TreeDynamics, "_grouped", lambda r: [r._link_inertia(link) for link in r.links]
+        TreeDynamics, "group_inertias", lambda r: [r.link_inertia(link) for link in r.links]
     )
     plain = every_route(system, accelerations)
     for route in ("composite", "articulated"):

@@ -9,9 +9,8 @@ from sympy.physics.mechanics import dynamicsymbols
 from eomc.base.errors import EomcError, SceneError
 from eomc.derive import lagrange
 from eomc.derive.outputs import outputs
-from eomc.model.from_scene import from_scene
-from eomc.model.system import System, dot, symbol, t
-from eomc.program import interpret, program
+from eomc.model.system import System, dot, from_scene, symbol, t
+from eomc.program import ir, program
 from eomc.scene.read import parse
 
 X, V, A = (symbol(n) for n in ("x", "x_dot", "x_ddot"))
@@ -32,7 +31,7 @@ y = "sin(k*x)*cos(t) + x**3"
 def value(text: str, **state: float) -> float:
     system = from_scene(parse(HEAD + f'a = "{text}"\n', "one.toml"))
     functions = program.build(lagrange.derive(system))
-    (result,), _ = interpret.evaluate(functions["outputs"], state)
+    (result,), _ = ir.evaluate(functions["outputs"], state)
     return result
 
 
@@ -74,7 +73,7 @@ def test_outputs_from_symbols_and_from_dynamicsymbols() -> None:
     state = {"x": 0.3, "x_dot": -0.7, "x_ddot": 1.1, "t": 0.4}
     for system in (one, other):
         functions = program.build(lagrange.derive(system))
-        result, _ = interpret.evaluate(functions["outputs"], state)
+        result, _ = ir.evaluate(functions["outputs"], state)
         assert result == pytest.approx([2 * 0.3 * -0.7 + 1.1, 0.12])
     for invalid in ({"for": X}, {"a": sympy.Symbol("z")}, [X]):
         with pytest.raises(EomcError, match=r"outputs|output a"):

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Modules
+from support.session import Modules
 
 from eomc.derive import lagrange
 from eomc.model.system import System
 from eomc.program import program
-from eomc.program.interpret import evaluate
+from eomc.program.ir import evaluate
 
 PARAMETERS = {"c": 0.1, "n": 1.5, "k": 2.0}
 FLAT = {  # all derivatives are 0 where x < 0 and the other variables are 0

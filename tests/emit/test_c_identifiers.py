@@ -17,14 +17,14 @@ from pathlib import Path
 
 import cffi
 import pytest
-from cases import scene_system
-from conftest import needs
+from support.cases import scene_system
+from support.session import needs, tiers
 
 import eomc
 from eomc.base import names
 from eomc.derive import lagrange
-from eomc.emit import c_names
-from eomc.model import from_scene as system
+from eomc.emit.common import c_names
+from eomc.model import system
 from eomc.model.symbols import Coordinate
 from eomc.program import program
 from eomc.scene import read as scene
@@ -371,7 +371,7 @@ def code_of(text: str) -> dict[str, str]:
     return {f: re.sub(ignored, "", c, flags=re.DOTALL) for f, c in files.items()}
 
 
-@pytest.mark.parametrize("prefix", ["robot_", "left_arm_"])
+@pytest.mark.parametrize("prefix", tiers(["robot_", "left_arm_"], "robot_"))
 def test_common_prefix_of_coordinates_is_removed_in_c(prefix: str) -> None:
     text = MECHANISM.replace("PREFIX_", prefix)
     assert code_of(text) == code_of(MECHANISM.replace("PREFIX_", ""))

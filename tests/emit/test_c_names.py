@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import pytest
-from conftest import Modules, tiers
+from support.session import Modules, tiers
 
-from eomc.model.from_scene import from_scene
+from eomc.model.system import from_scene
 from eomc.scene.read import parse
+from eomc.verify import convergence
 from eomc.verify.check import check
-from eomc.verify.comparison import Comparison
 
 UNUSED = """eomc = 1
 name = "called_w"
@@ -61,7 +61,7 @@ def test_names_of_scenes_do_not_collide_with_temporaries(
 
     The temporary then got the value of the parameter.
     """
-    monkeypatch.setattr(Comparison, "add_advice_check", lambda *_: None)
+    monkeypatch.setattr(convergence, "advice_checks", lambda *_: ())
     system = from_scene(parse(f"{text}[run]\nduration = 2\nh = 0.01\n{run}\n"))
     report = check(system, modules.unoptimised(system), states=4)
     assert report.passed, report.table()

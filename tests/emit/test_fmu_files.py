@@ -10,17 +10,16 @@ from itertools import product
 from pathlib import Path
 
 import pytest
-from compilers import compiled, run
-from conftest import EVERYTHING, needs, tiers
-from fmus import BALL, FLOAT, RIG, derived_of
-from payloads import FEW, PAYLOADS, RAW, derived, tokens, with_texts
+from support.compilation import compiled, run
+from support.fmus import BALL, FLOAT, RIG, derived_of
+from support.payloads import FEW, PAYLOADS, RAW, derived, tokens, with_texts
+from support.session import EVERYTHING, needs, tiers
 
 from eomc import pipeline
 from eomc.base import resources, texts
 from eomc.emit import render
-from eomc.emit.fmu import variables
-from eomc.emit.fmu.unit import Unit
-from eomc.model.from_scene import from_scene
+from eomc.emit.fmu import Unit, parse_unit
+from eomc.model.system import from_scene
 from eomc.scene.read import parse
 from eomc.toolchain.files import write_files
 
@@ -77,7 +76,7 @@ def description_of(unit: Unit) -> ET.Element:
     ],
 )
 def test_units_of_measurement_have_si_exponents(text: str, attributes: dict[str, str]) -> None:
-    meaning = variables.parse_unit(text)
+    meaning = parse_unit(text)
     assert meaning is not None and dict(meaning.attributes) == attributes
 
 
@@ -87,7 +86,7 @@ def test_units_of_measurement_have_si_exponents(text: str, attributes: dict[str,
      "m" + "/s" * 30, "((((", "^", "kkg", "k", "m^1.5"],
 )  # fmt: skip
 def test_unknown_units_have_no_si_exponents(text: str) -> None:
-    assert variables.parse_unit(text) is None
+    assert parse_unit(text) is None
 
 
 @pytest.mark.parametrize("version", [2, 3])

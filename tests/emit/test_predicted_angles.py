@@ -9,14 +9,14 @@ from types import ModuleType
 import mpmath
 import numpy as np
 import pytest
-from cases import FMA, ODD, SCENES, fast_files, odd_system, scene_system
-from conftest import MODULES, Modules, needs, tiers
+from support.cases import FMA, ODD, SCENES, fast_files, odd_system, scene_system
+from support.session import MODULES, Modules, needs, tiers
 from sympy import Rational, S
 
 import eomc
 from eomc.derive import lagrange
 from eomc.integrators.tableaux import METHODS
-from eomc.model import from_scene as system
+from eomc.model import system
 from eomc.program import program
 from eomc.program.two_point import separate_angles
 from eomc.scene import read as scene
@@ -182,16 +182,17 @@ def test_run_in_several_calls_is_bitwise_the_same(
         {
             for (int way = 0; way < 3; way++) {
                 double q[2] = { 0.0, 1.5 }, qd[2] = { 0.0, 0.0 };
-                NAME_rk4_memory memory;
-                NAME_status status;
+                NAME_memory memory = { 0 };
+                NAME_options options = { .h = H };
+                NAME_output output = { .memory = way < 2 ? &memory : 0 };
                 long part[3] = { 2000, 0, 0 };
 
                 if (way > 0)
                     part[0] = 1, part[1] = 700, part[2] = 1299;
-                memory.warm = 0;
-                for (long k = 0, n = 0; k < 3; n += part[k++])
-                    NAME_rk4_run(q, qd, H, n, part[k], 0, 0, 0, &NAME_defaults,
-                        way < 2 ? &memory : 0, &status);
+                for (long k = 0; k < 3; k++) {
+                    options.steps = part[k];
+                    NAME_integrate(q, qd, &NAME_defaults, &options, &output);
+                }
                 printf("%.17g %.17g %.17g %.17g\n", q[0], q[1], qd[0], qd[1]);
             }
             return 0;
@@ -216,13 +217,15 @@ static void METHOD_by_hand(void)
 {
     for (int way = 0; way < 2; way++) {
         double q[2] = { 0.0, 0.5 }, qd[2] = { 0.0, 0.0 };
-        cartpole_METHOD_memory memory = { 0 };
-        cartpole_status status;
+        cartpole_memory memory = { 0 };
+        cartpole_options options = { .method = CARTPOLE_METHOD_UPPER, .h = 0.005, .steps = 17 };
+        cartpole_output output = { .memory = &memory };
 
-        cartpole_METHOD_run(q, qd, 0.005, 0, 17, 0, 0, 0, &cartpole_defaults, &memory, &status);
+        cartpole_integrate(q, qd, &cartpole_defaults, &options, &output);
         q[1] += 1e-5;
-        cartpole_METHOD_run(q, qd, 0.005, 17, 1, 0, 0, 0, &cartpole_defaults, way ? &memory : 0,
-            &status);
+        options.steps = 1;
+        output.memory = way ? &memory : 0;
+        cartpole_integrate(q, qd, &cartpole_defaults, &options, &output);
         printf("%.17g %.17g %.17g %.17g\n", q[0], q[1], qd[0], qd[1]);
     }
 }
@@ -236,7 +239,10 @@ def test_workspace_of_another_state_is_ignored(tmp_path: Path, modules: Modules)
     cartpole = system.from_scene(scene.parse(text, "cartpole.toml"))
     for file, written in fast_files(modules.unoptimised(cartpole)).items():
         (tmp_path / file).write_text(written, encoding="utf-8")
-    functions = "".join(BY_HAND.replace("METHOD", m) for m in METHODS_OF_MEMORY)
+    functions = "".join(
+        BY_HAND.replace("UPPER", m.upper()).replace("METHOD_by_hand", f"{m}_by_hand")
+        for m in METHODS_OF_MEMORY
+    )
     calls = " ".join(f"{m}_by_hand();" for m in METHODS_OF_MEMORY)
     main = f'#include "cartpole.h"\n#include <stdio.h>\n{functions}\nint main(void) {{ {calls} }}\n'
     (tmp_path / "hand.c").write_text(main, encoding="utf-8")

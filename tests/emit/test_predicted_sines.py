@@ -10,12 +10,12 @@ from pathlib import Path
 import mpmath
 import numpy as np
 import pytest
-from cases import FMA, fast_files, odd_system, scene_system
-from conftest import Modules, needs, tiers
+from support.cases import FMA, fast_files, odd_system, scene_system
+from support.session import Modules, needs, tiers
 
 from eomc.derive import lagrange
-from eomc.emit.c_expression import DOUBLE
-from eomc.emit.c_names import Target
+from eomc.emit.common.c_expression import DOUBLE
+from eomc.emit.common.c_names import Target
 from eomc.emit.optimised.lanes import Accelerations
 from eomc.program import program
 from eomc.program.two_point import Angle
@@ -220,7 +220,9 @@ def test_steps_fail_beyond_the_range_of_predictions(build: str, tmp_path: Path) 
             const double predicted[2] = { 0.0, x + shift };
             eomc_rk4_state m = { 0 };
             eomc_constants c;
-            long done;
+            eomc_options options = { .h = h };
+            eomc_output output = { 0 };
+            long done, next = LONG_MAX;
             int same;
 
             eomc_compute_constants(&c, &eomc_defaults);
@@ -229,7 +231,7 @@ def test_steps_fail_beyond_the_range_of_predictions(build: str, tmp_path: Path) 
             eomc_sines_at(&m.s, m.q);
             eomc_accelerations(m.a, m.q, m.qd, &m.s, &c);
             eomc_predict(&m.next, predicted, m.qd, m.a, h/2, h);
-            done = eomc_rk4_predicted(&m, h, 0, 0, (long)steps, 0, 0, 0, &c);
+            done = eomc_rk4_predicted(&m, 0, (long)steps, &options, &output, &next, &c);
             same = m.q[0] == 0 && (m.q[1] == x || x != x) && m.qd[0] == 0.1 && m.qd[1] == 0.2;
             printf("%ld %d %.17g %.17g %.17g\n", done, same, m.q[1], m.s.s[0], m.s.c[0]);
         }

@@ -6,11 +6,11 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from conftest import Modules
+from support.session import Modules
 
-from eomc.model.from_scene import from_scene
-from eomc.model.loops import find_wrong_rotations
-from eomc.program.assembly import assembled
+from eomc.mechanism.assembly import assembled
+from eomc.model.constraints import find_wrong_rotations
+from eomc.model.system import from_scene
 from eomc.scene.read import parse
 
 # a rolling ball: K is singular along the quaternion, whose length a constraint fixes

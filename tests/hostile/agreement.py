@@ -28,12 +28,12 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
-from cases import SCENES
-from random_scenes import EXTENSION, built
+from support.cases import SCENES
+from support.random_scenes import EXTENSION, built
 
 import eomc
-from eomc.model.from_scene import from_scene
-from eomc.program.assembly import assembled
+from eomc.mechanism.assembly import assembled
+from eomc.model.system import from_scene
 from eomc.scene.read import parse
 from eomc.toolchain import compiler
 from eomc.toolchain.files import write_files

@@ -37,7 +37,7 @@ from typing import Any
 import numpy as np
 
 import eomc
-from eomc.model.from_scene import from_scene
+from eomc.model.system import from_scene
 from eomc.scene.read import parse
 
 HERE = Path(__file__).parent
@@ -188,7 +188,9 @@ SINGLE = {
     "drive_forces",
     "Params",
 }
-OTHER = {"Run", "Estimate", "Interrupted", "load_run", "defaults", "MotionError", "Batch", "dtype"}
+OTHER = {
+    "Trajectory", "Estimate", "Interrupted", "load_run", "defaults", "MotionError", "Batch", "dtype"
+}  # fmt: skip
 LEFT_OUT = object()
 
 

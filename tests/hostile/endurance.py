@@ -29,8 +29,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from cases import SCENES
-from forks import in_a_fork
+from support.cases import SCENES
+from support.forks import in_a_fork
 
 import eomc
 from eomc.base.errors import SceneError

@@ -24,8 +24,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import eomc
-from eomc.model.from_scene import from_scene
-from eomc.program.assembly import assembled
+from eomc.mechanism.assembly import assembled
+from eomc.model.system import from_scene
 from eomc.scene.read import parse
 
 HERE = Path(__file__).parent
@@ -86,17 +86,38 @@ def _argument(text: str) -> Argument:
 
 # --- driver ---------------------------------------------------------------------------------------
 
-# Names of scalar arguments and their values; {R} is the element type, {N} and {n} the prefixes.
-SCALARS = {
-    "steps": "up_to(24)", "every": "up_to(5)", "count": "up_to(9)", "room": "up_to(80)",
-    "first": "byte() % 3 ? up_to(9) : 1099511627776L", "u_stride": "byte() % 2 ? {nu} : 0",
-    "u_instance": "byte() % 2 ? {nu}*(steps + 1) : 0", "u_step": "byte() % 2 ? {nu} : 0",
-    "p_instance": "(long)(byte() % 2)",
+# Members of the options of a run and their values; {N} is the prefix.
+OPTIONS = {
+    "t0": "(REAL)number()", "t_end": "(REAL)number()", "h": "byte() % 3 ? (REAL)small_number() : 0",
+    "tol": "(REAL)small_number()", "max_step": "byte() % 2 ? (REAL)small_number() : 0",
+    "stiff": "byte() % 5 == 0", "steps": "up_to(24)", "every": "up_to(5)", "rows": "up_to(60)",
+    "max_evaluations": "byte() % 2 ? up_to(500) : 0", "ignores_events": "byte() % 2",
+    "u_step": "byte() % 2 ? {N}_NU : 0", "p_instance": "byte() % 2",
+    "u_instance": "byte() % 2 ? {N}_NU*(2*options.steps + 2) : 0",
 }  # fmt: skip
-ARRAYS = {
-    "q_rows": "{rows}*{N}_NQ", "qd_rows": "{rows}*{N}_NQ", "t_rows": "{rows}",
-    "event_rows": "room*(1 + 2*{N}_NQ)",
-}  # fmt: skip
+RUN = """        const long count = {count};
+        long i, k;
+        {n}_options options;
+        {n}_output *output = space((size_t)(count + 1)*sizeof *output);
+        REAL *a_q = given(count*{N}_NQ), *a_qd = given(count*{N}_NQ), *times = NULL, at;
+{options}
+        if (byte() % 2 && options.rows) {{
+            options.times = times = unwritten(options.rows);
+            for (i = 0, at = options.t0; i < options.rows; i++)
+                times[i] = at += (REAL)ldexp(1.0, -(int)(byte() % 30));
+        }}
+        for (k = 0; k < count; k++) {{
+            output[k].q_rows = unwritten(options.rows*{N}_NQ);
+            output[k].qd_rows = unwritten(options.rows*{N}_NQ);
+{results}
+        }}
+        REAL *was_q = copied(a_q, count*{N}_NQ), *was_qd = copied(a_qd, count*{N}_NQ);
+        for (i = byte() % 2; i >= 0; i--)
+            if ({call})
+                break;
+        if (finite_all(was_q, count*{N}_NQ) && finite_all(was_qd, count*{N}_NQ) &&
+            !(finite_all(a_q, count*{N}_NQ) && finite_all(a_qd, count*{N}_NQ)))
+            broken("{f}", "a run left what is not finite", 0, a_q, was_q, count*{N}_NQ);"""
 
 
 class Driver:
@@ -105,9 +126,11 @@ class Driver:
     def __init__(self, scene: str, header: str) -> None:
         self.n, self.N = scene, scene.upper()
         self.functions = list(functions(header, scene))
-        self.fixed = bool(re.search(r"_fixed_step\s*\*step;", header))
         self.real = "float" if re.search(r"\bfloat q\[", header) else "double"
-        self.nu = f"{self.N}_NU" if f"{self.N}_NU" in header else "0"
+        bare = re.sub(r"/\*.*?\*/", "", header, flags=re.S)
+        pattern = rf"typedef struct \{{([^}}]*)\}} {scene}_(options|output);"
+        self.structs = {name: text for text, name in re.findall(pattern, bare)}
+        self.methods = len(re.findall(rf"\b{self.N}_METHOD_\w+", bare))
 
     def text(self) -> str:
         """Return the whole text."""
@@ -126,39 +149,57 @@ class Driver:
             f"{cases}\n    }}\n}}\n"
         )
 
-    def _case(self, k: int, f: Function) -> str:
+    def _run(self, f: Function) -> str:
+        """Return the lines of a call of `integrate` or `integrate_batch`, or of two in a row."""
+        batch, n, N = f.name.endswith("_batch"), self.n, self.N
+        options = ["memset(&options, 0, sizeof options);"]
+        for name, value in OPTIONS.items():
+            if self.has_member("options", name):
+                options.append(f"options.{name} = {value.format(N=N)};")
+        if self.has_member("options", "method"):
+            options.append(f"options.method = ({n}_method)(byte() % {self.methods});")
+        results = []
+        if self.has_member("output", "t_rows"):
+            results.append("output[k].t_rows = unwritten(options.rows);")
+        if self.has_member("output", "memory"):
+            results.append("output[k].memory = byte() % 3 ? space(sizeof *output->memory) : NULL;")
+        if self.has_member("output", "room"):
+            results += [
+                "output[k].room = up_to(80);",
+                "if (byte() % 2) {",
+                "    output[k].which = space((size_t)output[k].room*sizeof *output->which);",
+                f"    output[k].event_rows = unwritten(output[k].room*(1 + 2*{N}_NQ));",
+                "}",
+            ]
+        one = "1" if not batch or not self.has_member("options", "p_instance") else ""
+        p = f"parameters({one or 'options.p_instance ? count : 1'})"
+        values = {"count": "count", "q": "a_q", "qd": "a_qd", "options": "&options"}
+        values |= {"output": "output", "p": "a_p", "u": "a_u"}
         names = [a.name for a in f.arguments]
-        batch, adaptive = f.name.endswith("_batch"), f.name.endswith("_adaptive")
-        rows = "2*steps" if adaptive else "count*row_count" if batch else "(steps + 1)"
-        lines = []
-        for name in SCALARS:  # in this order, because some depend on others
-            if name in names:
-                value = SCALARS[name].format(nu=self.nu)
-                lines.append(f"const long {name} = {value};")
-        many = f.name.endswith("_adaptive_batch")
-        if many:
-            lines.append("const long row_count = up_to(6);")
-        elif batch:
-            lines[:] = [x.replace(SCALARS["first"], "up_to(9)") for x in lines]
-            lines.append("const long row_count = (first + steps)/(every ? every : 1) + 2;")
-        if "times" in names:
-            lines.append("const int asked = byte() % 2;")
-            rows = rows if many else "(asked ? count : 2*steps)"
-        values = [self._value(f, a, rows, batch) for a in f.arguments]
+        if "p" in names:
+            options.append(f"{n}_params *a_p = {p};")
+        if "u" in names:
+            size = f"{N}_NU*(2*options.steps + 2)*count"
+            options.append(f"REAL *a_u = byte() % 2 ? given({size}) : NULL;")
+        call = f"{f.name}({', '.join(values[name] for name in names)})"
+        return RUN.format(
+            count="up_to(9)" if batch else "1", n=n, N=N, f=f.name, call=call,
+            options="\n".join(f"        {line}" for line in options),
+            results="\n".join(f"            {line}" for line in results),
+        )  # fmt: skip
+
+    def has_member(self, struct: str, name: str) -> bool:
+        """Return True if a struct of the scene, "options" or "output", has a member."""
+        return bool(re.search(rf"\b{name}\b", self.structs[struct]))
+
+    def _case(self, k: int, f: Function) -> str:
+        if f.name.endswith(("_integrate", "_integrate_batch")):
+            return f"    case {k}: {{\n{self._run(f)}\n        break;\n    }}"
+        values = [self._value(f, a) for a in f.arguments]
         results = [
             (a, name) for a, (name, _) in zip(f.arguments, values, strict=True) if self._result(a)
         ]
-        lines += [text for _, text in values if text]
-        row_count = "row_count" if many else "count"
-        if many:
-            lines.append(
-                "{ long i; for (i = 0; i < count; i++) a_memory[i].stiff = byte() % 5 == 0; }"
-            )
-        if "times" in names:
-            lines.append(
-                f"{{ REAL at = *a_t; long i; for (i = 0; a_times && i < {row_count}; i++) "
-                "a_times[i] = at += (REAL)ldexp(1.0, -(int)(byte() % 30)); }"
-            )
+        lines = [text for _, text in values if text]
         call = f"{f.name}({', '.join(name for name, _ in values)})"
         before = [(name, self._size(a)) for a, name in results]
         for name, size in before:
@@ -180,37 +221,7 @@ class Driver:
                 f'if (fine || status) promised("{f.name}", status, {n}, was_{n}, {s});'
                 for n, s in before
             ]
-        if f.result == "long":
-            # with a workspace, and possibly in two parts
-            again = f"if (byte() % 2 && *a_status == {self.N}_OK) (void){call};"
-            fresh = "if (byte() % 3 == 0) a_memory = space(sizeof *a_memory);"
-            lines = [
-                fresh,
-                *self._stepped(f),
-                f"(void){call};",
-                f"if (a_memory != NULL) {{ {again} }}",
-            ]
-            fine = " && ".join(f"finite_all(was_{n}, {s})" for n, s in before)
-            if any(a.name == "t" and a.kind == f"{self.real} *" for a in f.arguments):
-                fine += " && isfinite(before_t)"
-            lines.append(
-                f"if ({fine}) {{ {' '.join(self._check_finite(f, n, s) for n, s in before)} }}"
-            )
-            return lines
-        again = [f"if (byte() % 2) (void){call};"] if f.name.endswith("_adaptive_batch") else []
-        return [f"(void){call};", *again]
-
-    def _stepped(self, f: Function) -> list[str]:
-        """Return steps of fixed size with event location, as a substitute for adaptive ones."""
-        steps = [x.name for x in self.functions if x.name.endswith("_step")]
-        if not (f.name.endswith("_adaptive") and self.fixed):
-            return []
-        return [f"if (a_memory && byte() % 2) a_memory->step = {one};" for one in steps]
-
-    def _check_finite(self, f: Function, name: str, size: str) -> str:
-        what = f'"{f.name}", "a run left what is not finite"'
-        arguments = f"(int)*a_status, {name}, was_{name}, {size}"
-        return f"if (!finite_all({name}, {size})) broken({what}, {arguments});"
+        return [f"(void){call};"]
 
     def _result(self, a: Argument) -> bool:
         return bool(a.size) and a.kind == self.real
@@ -218,71 +229,25 @@ class Driver:
     def _size(self, a: Argument) -> str:
         return f"(long)({a.size})"
 
-    def _value(self, f: Function, a: Argument, rows: str, batch: bool) -> tuple[str, str]:
+    def _value(self, f: Function, a: Argument) -> tuple[str, str]:
         """Return the expression that is passed, and the line that defines it."""
         R, name, own = self.real, a.name, f"a_{a.name}"
-        if a.kind == "long":
-            return name, ""
         if a.size:
-            return self._reals(f, a, rows, batch)
+            filled = a.kind.startswith("const") or name in ("q", "qd")
+            if not a.kind.startswith("const") and not re.search(r"_(step|project)$", f.name):
+                filled = False
+            return own, f"{R} *{own} = {'given' if filled else 'unwritten'}({self._size(a)});"
         if a.kind == R:
-            small = name in ("h", "tol", "max_step")
-            return own, f"const {R} {own} = ({R}){'small_number()' if small else 'number()'};"
+            return own, f"const {R} {own} = ({R}){'small_number()' if name == 'h' else 'number()'};"
         if name == "p":
-            count = "(p_instance ? count : 1)" if batch else "1"
-            text = f"{self.n}_params *{own} = "
-            default = "" if batch else f"byte() % 2 ? ({self.n}_params *)&{self.n}_defaults : "
-            return own, f"{text}{default}parameters({count});"
-        if name == "memory" and batch:
-            text = f"space((size_t)(count + 1)*sizeof *{own})"
-            return own, f"{f.name.removesuffix('_batch')}_memory *{own} = {text};"
-        if name == "memory":
-            return own, f"{f.name.removesuffix('_run')}_memory *{own} = NULL;"
-        if name == "status":
-            kind = "int" if batch else f"{self.n}_status"
-            count = "(size_t)count*" if batch else ""
-            return own, f"{kind} *{own} = space({count}sizeof *{own});"
-        if name in ("completed", "events", "row_counts"):
-            count = "1" if name == "events" and not batch else "count + 1"
-            return own, f"long *{own} = space((size_t)({count})*sizeof *{own});"
+            text = f"{self.n}_params *{own} = byte() % 2 ? "
+            return own, f"{text}({self.n}_params *)&{self.n}_defaults : parameters(1);"
         if name == "fixed":
             fill = f"for (i = 0; {own} && i < 2*{self.N}_NQ; i++) {own}[i] = (int)(byte() % 2);"
             text = f"byte() % 2 ? space(2*{self.N}_NQ*sizeof *{own}) : NULL"
             return own, f"int *{own} = {text}; {{ int i; {fill} }}"
-        if name == "which":
-            text = f"space((size_t)({'count*' if batch else ''}room)*sizeof *{own})"
-            return own, f"int *{own} = byte() % 2 ? {text} : NULL;"
-        return self._reals(f, a, rows, batch)
-
-    def _reals(self, f: Function, a: Argument, rows: str, batch: bool) -> tuple[str, str]:
-        """Return an array of numbers."""
-        R, name, own = self.real, a.name, f"a_{a.name}"
-        if a.size:
-            filled = a.kind.startswith("const") or name in ("q", "qd")
-            if not a.kind.startswith("const") and not re.search(
-                r"_(step|run|adaptive|project)$", f.name
-            ):
-                filled = False
-            return own, f"{R} *{own} = {'given' if filled else 'unwritten'}({self._size(a)});"
         if name == "u":
-            count = self.nu
-            if batch:
-                count = f"{self.nu}*(steps + 1)*(u_instance ? count : 1)"
-            elif any(x.name == "u_stride" for x in f.arguments):
-                count = f"{self.nu}*(steps + 1)"
-            return own, f"{R} *{own} = byte() % 2 ? given({count}) : NULL;"
-        if name in ("q", "qd"):  # of a batch
-            return own, f"{R} *{own} = given(count*{self.N}_NQ);"
-        if name == "t":
-            count = "count + 1" if batch else "1"
-            text = f"{R} *{own} = given({count})"
-            return own, f"{text}; const {R} before_t = *{own}; (void)before_t;"
-        if name == "times":
-            return own, f"{R} *{own} = asked ? given({'row_count' if batch else 'count'}) : NULL;"
-        if name in ARRAYS:
-            size = ARRAYS[name].format(rows=rows, N=self.N)
-            size = f"count*{size}" if batch and name == "event_rows" else size
-            return own, f"{R} *{own} = unwritten({size});"
+            return own, f"{R} *{own} = byte() % 2 ? given({self.N}_NU) : NULL;"
         raise AssertionError(f"{f.name}: what is {a}?")
 
 

@@ -33,8 +33,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from builds import CHANGED, TEXT, gravity, leftovers, script
 from killed_builds import OLD
+from support.builds import CHANGED, TEXT, gravity, leftovers, script
 
 import eomc
 from eomc.cli.main import main as command

@@ -27,8 +27,8 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from builds import CHANGED, TEXT, gravity, leftovers
-from instrument import in_a_fork
+from support.builds import CHANGED, TEXT, gravity, leftovers
+from support.forks import in_a_fork
 
 import eomc
 

@@ -22,8 +22,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from builds import CHANGED, TEXT, gravity, leftovers
 from killed_builds import OLD
+from support.builds import CHANGED, TEXT, gravity, leftovers
 
 import eomc
 from eomc.toolchain import cache

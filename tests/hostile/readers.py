@@ -38,14 +38,17 @@ import atheris
 with atheris.instrument_imports(include=["eomc"]):
     from eomc.base.errors import EomcError
     from eomc.cli.main import COMMANDS, main
-    from eomc.model.from_scene import from_scene
-    from eomc.robots import edit, limits, preparation, scene_text, urdf
-    from eomc.robots.mjcf import read as mjcf
+    from eomc.model.system import from_scene
+    from eomc.robots import edit, mjcf, scene_text, urdf
     from eomc.scene import formulas
     from eomc.scene.read import parse
 
 HERE = Path(__file__).parent
 TESTS, ROOT = HERE.parent, HERE.parents[1]
+sys.path.insert(0, str(TESTS))
+
+from support.bad_scenes import bad_scenes  # noqa: E402
+
 OUTPUT_FOLDER = ROOT / "build" / "hostile"
 SECONDS = 10.0  # allowed for one input
 MEMORY = 2**30  # bytes that all inputs together may add
@@ -97,12 +100,12 @@ def _robot(data: bytes, reader: Callable[[Path], Any]) -> bool:
     path.write_bytes(data)
 
     def stopped(robot: Any) -> Any:
-        return edit.with_joint_stops(robot) if limits.joint_stops(robot) else robot
+        return edit.with_joint_stops(robot) if edit.joint_stops(robot) else robot
 
     def convert() -> None:
         robot = reader(path)
         for change in (lambda r: r, edit.with_nearest_inertias, stopped):
-            text = scene_text.scene_text(preparation.prepare_for_scene(change(robot)))
+            text = scene_text.scene_text(scene_text.prepare_for_scene(change(robot)))
             read_back = parse(text, "fuzz.xml.toml")
             if len(robot.bodies) < SYMPY_FROM:
                 from_scene(read_back)
@@ -169,7 +172,11 @@ def seeds(name: str) -> list[Path]:
     place = "scene" if name == "read" else name
     folders = [HERE / "corpus" / place]
     if place == "scene":
-        folders += [ROOT / "scenes", TESTS / "scene" / "bad", TESTS / "report" / "pictured"]
+        bad = OUTPUT_FOLDER / "bad_scenes"
+        bad.mkdir(parents=True, exist_ok=True)
+        for scene in bad_scenes():
+            (bad / f"{scene.name}.toml").write_bytes(scene.text)
+        folders += [ROOT / "scenes", bad, TESTS / "report" / "pictured"]
     return folders
 
 

@@ -1,4 +1,4 @@
-"""A minute of tests/hostile/endurance.py, and its detection of leaks."""
+"""Half a minute of tests/hostile/endurance.py, and its detection of leaks."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from endurance import LEAST, Sample, growth_messages, run_rounds, sample
-from forks import in_a_fork
+from support.forks import in_a_fork
 
 STEADY = Sample(
     memory=100 << 20, objects=500_000, heap=30 << 20, handles=6, threads=1, children=0, files=500
@@ -49,5 +49,5 @@ def test_memory_in_use_is_measured_without_free_memory(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_nothing_grows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CC", "cc")  # otherwise compiled files would be stored for other tests
-    how, words = in_a_fork(lambda: growth_messages(run_rounds(tmp_path, 60)), 600)
+    how, words = in_a_fork(lambda: growth_messages(run_rounds(tmp_path, 30)), 600)
     assert (how, words) == ("done", [])

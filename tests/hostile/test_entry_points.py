@@ -10,8 +10,8 @@ from pathlib import Path
 
 import entry_points
 import pytest
-from conftest import needs
 from entry_points import VARIANTS, Driver, run_driver
+from support.session import needs
 
 pytestmark = pytest.mark.slow
 

@@ -9,7 +9,7 @@ import sys
 
 import failing_calls
 import pytest
-from conftest import needs
+from support.session import needs
 
 
 @pytest.mark.slow

@@ -10,12 +10,12 @@ import pytest
 import sympy
 
 from eomc.model.algebra import compile_function
-from eomc.model.from_scene import from_scene
 from eomc.model.symbols import symbol
+from eomc.model.system import from_scene
 from eomc.report.equations_text import write_equations
 from eomc.scene.read import parse
 from eomc.verify import symbolic
-from eomc.verify.checks_inputs_outputs import Formulas
+from eomc.verify.outputs import Formulas
 from eomc.verify.sampling import State
 
 # names of Python, NumPy, mpmath and SymPy, and of the code that expressions compile to

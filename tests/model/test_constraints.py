@@ -6,9 +6,8 @@ from sympy.physics.mechanics import dynamicsymbols
 
 from eomc.base.errors import EomcError
 from eomc.model.constraints import VelocityDegree
-from eomc.model.from_scene import from_scene
 from eomc.model.symbols import Coordinate, dot, symbol, t
-from eomc.model.system import System
+from eomc.model.system import System, from_scene
 from eomc.scene.read import parse
 
 SCENE = """
@@ -121,6 +120,10 @@ def test_guesses_defined_in_python():
     assert [(c.start, c.start_fixed) for c in system.coordinates] == [(0.0, False), (-0.8, False)]
     system = make_pendulum(coordinates={x: (None, 2.0), y: -0.8}, guess=["x"])
     assert [(c.rate, c.rate_fixed) for c in system.coordinates] == [(2.0, False), (0.0, False)]
+    (warning,) = make_pendulum(
+        guess=["x"], constraints={}, parameters={}, inputs={}, definitions={}
+    ).warnings
+    assert str(warning).startswith("System pendulum: warning: guess.x: changes nothing")
     free = make_pendulum(coordinates=[x, y], constraints=None)
     assert all(c.start_fixed and c.rate_fixed for c in free.coordinates)
     assert not free.constraints
@@ -140,7 +143,7 @@ def test_dynamicsymbols_in_constraints():
 
 
 def test_velocity_form_of_a_position_constraint_is_warned_of():
-    (warning,) = make_pendulum(constraints={"roll": "x_dot - l*y_dot"}).warnings
+    *_, warning = make_pendulum(constraints={"roll": "x_dot - l*y_dot"}).warnings
     assert warning.severity == "warning"
     assert "write the position itself, -l*y + x, less its value at the start" in warning.message
 
@@ -149,23 +152,22 @@ def test_velocity_form_of_a_position_constraint_is_warned_of():
     ("options", "message"),
     [
         ({"constraints": ["x"]}, "constraints: give a dict"),
-        ({"constraints": {3: "x"}}, "3 is not a name"),
+        ({"constraints": {3: "x"}}, "'3' is not a plain name"),
         ({"constraints": {"lambda": "x"}}, "'lambda' is a Python keyword"),
-        ({"constraints": {"l": "x"}}, "the name 'l' is taken already"),
-        ({"constraints": {"s": "x"}}, "the name 's' is taken already"),
-        ({"constraints": {"rod": "z"}}, "z not declared"),
-        ({"constraints": {"rod": "x_ddot"}}, "x_ddot not declared"),
-        ({"constraints": {"rod": "s - y"}}, "rod: u is an input, whose rate is not known"),
-        ({"constraints": {"rod": "u - y"}}, "rod: u is an input, whose rate is not known"),
+        ({"constraints": {"l": "x"}}, "constraints.l: 'l' stands in parameters already"),
+        ({"constraints": {"s": "x"}}, "constraints.s: 's' stands in definitions already"),
+        ({"constraints": {"rod": "z"}}, "constraints.rod: 'z' is not declared"),
+        ({"constraints": {"rod": "x_ddot"}}, "'x_ddot' is not declared: accelerations are"),
+        ({"constraints": {"rod": "s - y"}}, "constraints.rod: a constraint can't depend on inputs"),
+        ({"constraints": {"rod": "u - y"}}, "constraints.rod: a constraint can't depend on inputs"),
         ({"constraints": {"rod": "l - t"}}, "has no coordinates or rates"),
         ({"constraints": {"rod": "x_dot**2 - l"}}, "is not linear in the rates"),
-        ({"constraints": {"rod": "sign(x) - l"}}, "constraint rod: sign(...) jumps, and it is"),
-        ({"constraints": {"x_dot": "x - y"}}, "constraint x_dot: the name 'x_dot' is taken"),
-        ({"constraints": {"energy": "x - y"}}, "constraint energy: the name 'energy' is taken"),
-        ({"outputs": {"rod": "x"}}, "outputs: 'rod' is a constraint already"),
+        ({"constraints": {"rod": "sign(x) - l"}}, "constraints.rod: sign(...) jumps, and constr"),
+        ({"constraints": {"x_dot": "x - y"}}, "x_dot: 'x_dot' is the velocity of 'x'"),
+        ({"constraints": {"energy": "x - y"}}, "constraints.energy: 'energy' is K + P"),
+        ({"outputs": {"rod": "x"}}, "constraints.rod: 'rod' stands in outputs already"),
         ({"guess": "x"}, "guess: give a list of coordinates"),
-        ({"guess": ["z"]}, "guess: z not among the coordinates"),
-        ({"guess": ["x"], "constraints": {}}, "guess: constraints move a guess"),
+        ({"guess": ["z"]}, "guess: 'z' is not among the coordinates"),
         ({"coordinates": {"x": (1, 2, 3), "y": 0}}, "give a start, or a pair"),
     ],
 )  # fmt: skip

@@ -6,8 +6,7 @@ import pytest
 import sympy
 
 from eomc.base.errors import SceneError
-from eomc.model.from_scene import from_scene
-from eomc.model.system import System
+from eomc.model.system import System, from_scene
 from eomc.scene.read import parse
 
 BALL = """eomc = 1
@@ -24,6 +23,8 @@ potential = "m*9.81*y"
 [[event]]
 name = "impact"
 when = "{}"
+[run]
+tolerance = 1e-9
 """
 
 

@@ -11,9 +11,8 @@ import sympy
 
 import eomc
 from eomc.derive import lagrange
-from eomc.model.from_scene import from_scene
-from eomc.model.system import symbol
-from eomc.program import interpret, program
+from eomc.model.system import from_scene, symbol
+from eomc.program import ir, program
 from eomc.scene.read import parse
 from eomc.verify import symbolic
 from eomc.verify.check import check
@@ -108,7 +107,7 @@ def build(text: str) -> Any:
 def test_generalized_force_agrees_with_the_jacobian(what: str) -> None:
     table, force, torque, (x, y) = CASES[what]
     at = {"a": 0.3, "b": -0.8, "a_dot": 0.4, "b_dot": 0.9, "F": 1.3, "M": 0.7, "t": 0.2}
-    result, _ = interpret.evaluate(build(f'{ARM}[[force]]\nbody = "lower"\n{table}\n')["tau"], at)
+    result, _ = ir.evaluate(build(f'{ARM}[[force]]\nbody = "lower"\n{table}\n')["tau"], at)
     point = (0.8 * sympy.cos(A) + C * x - S * y, 0.8 * sympy.sin(A) + S * x + C * y)
     for k, q in enumerate((A, B)):
         exact = sum(f * p.diff(q) for f, p in zip(force, point, strict=True)) + torque
@@ -131,7 +130,7 @@ def test_spatial_forces_agree_with_both_references() -> None:
         q, qd, u = rng.normal(size=4), rng.normal(size=4), rng.normal(size=1)
         names = [x.name for x in (*system.q, *system.qd, *system.u)]
         at = dict(zip(names, [*q, *qd, *u], strict=True)) | {"t": 0.4}
-        result, _ = interpret.evaluate(functions["tau"], at)
+        result, _ = ir.evaluate(functions["tau"], at)
         assert result == pytest.approx(jets.evaluate("tau", q, qd, 0.4, u), rel=1e-12)
 
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import sympy
-from conftest import Modules
+from support.session import Modules
 
 import eomc
 from eomc.base.errors import EomcError, SceneError
 from eomc.derive import lagrange
-from eomc.model.from_scene import from_scene
-from eomc.model.generalized_potential import NotLinearError, split_potential
-from eomc.model.system import System, dot, symbol
+from eomc.model.mechanics import NotLinearError, split_potential
+from eomc.model.system import System, dot, from_scene, symbol
 from eomc.program import program
 from eomc.scene.read import parse
 from eomc.verify import symbolic, taylor
@@ -83,7 +82,7 @@ def test_equations_contain_the_full_lorentz_force() -> None:
     assert rows == [m * x_ddot - e * B * y_dot, m * y_ddot + e * B * x_dot]
     assert sympy.expand(result.kinetic - result.L - e * B * (y * x_dot - x * y_dot) / 2) == 0
     assert result.potential == 0
-    assert "L, Lagrangian K - P - U" in str(result)
+    assert "Lagrangian K - P - U:" in str(result)
 
 
 @pytest.mark.parametrize("path", ["-e*B*x*y_dot", "e*B*y*x_dot + x*y_dot + y*x_dot"])
@@ -139,17 +138,17 @@ def test_potential_not_linear_in_velocities_is_refused(text: str) -> None:
 
 
 def test_systems_and_scenes_refuse_with_the_same_message() -> None:
-    with pytest.raises(EomcError, match=r"System\.make: potential: .* linear terms only") as error:
+    with pytest.raises(EomcError, match=r"potential: .* linear terms only") as error:
         charge("x_dot**2")
     with pytest.raises(SceneError) as read:
         from_scene(parse(CHARGE.replace("k*x**2/2", "k*x_dot**2/2")))
     (problem,) = read.value.problems
     assert problem.key == "energy.potential"
-    assert str(error.value).endswith(problem.message)
+    assert problem.message in str(error.value)
 
 
 def test_lagrangian_is_passed_as_two_energies() -> None:
-    with pytest.raises(EomcError, match="kinetic=K and potential=P"):
+    with pytest.raises(EomcError, match="kinetic = K and potential = P"):
         System.make("a", ["x"])
     text = 'eomc = 1\nname = "a"\n[coordinates]\nx = {}\n[energy]\nlagrangian = "x_dot**2"\n'
     with pytest.raises(SceneError, match="kinetic = K and potential = P"):

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import sympy
 
-from eomc.model.from_scene import from_scene
-from eomc.model.kinematics import Kinematics
-from eomc.model.loops import perpendicular_axes
+from eomc.model.constraints import perpendicular_axes
+from eomc.model.kinematics import ForwardKinematics
 from eomc.model.symbols import needed_definitions
+from eomc.model.system import from_scene
 from eomc.scene.joints import CLOSINGS
 from eomc.scene.read import parse
 
@@ -94,7 +94,6 @@ class TwoBodies:
         self.rows = self.numeric([row.formula for row in system.constraints])
         self.branches = self.numeric(self.reaction.branches)
         self.values = self.numeric(self.reaction.values, self.multipliers)
-        self.kinematics = Kinematics(self.scene, self.scene.assembly)
         if plane:
             self.points = [[x, y, 0.0] for x, y, _ in self.points]
 
@@ -109,7 +108,8 @@ class TwoBodies:
         """Return the joint's point on a body and the body's rotation."""
         at, R = (np.zeros(3), np.eye(3))
         if self.bodies[end] != "world":
-            at, R = self.kinematics.poses(q)[self.bodies[end]]
+            poses = ForwardKinematics(self.scene, np.zeros(1), np.array(q, float)[None]).poses
+            at, R = (x[0] for x in poses[self.bodies[end]])
         return at + R @ self.points[end], R
 
     def jacobian(self, q):

@@ -12,12 +12,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-import trees
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from support import trees
 
-from eomc.model.from_scene import from_scene
-from eomc.model.system import System
+from eomc.model.system import System, from_scene
 from eomc.scene.read import parse
 from eomc.verify.taylor import TaylorReference
 
@@ -65,6 +64,7 @@ def translation_along(axis: Any, distance: float) -> Array:
 
 
 IDENTITY = Rotation.identity()
+PITCH = -0.3  # m/rad
 
 # the displacement of the frame by the coordinates of each joint, from docs/scenes.md
 JOINTS: Mapping[str, tuple[int, Callable[[Array, Any], Pose]]] = {
@@ -73,6 +73,7 @@ JOINTS: Mapping[str, tuple[int, Callable[[Array, Any], Pose]]] = {
     "prismatic": (1, lambda q, a: (translation_along(a, q[0]), IDENTITY)),
     "planar": (3, lambda q, a: (q[0] * X + q[1] * Y, rotation_about(Z, q[2]))),
     "cylindrical": (2, lambda q, a: (translation_along(a, q[0]), rotation_about(a, q[1]))),
+    "screw": (1, lambda q, a: (translation_along(a, PITCH * q[0]), rotation_about(a, q[0]))),
     "universal": (
         2,
         lambda q, a: (np.zeros(3), rotation_about(a[0], q[0]) * rotation_about(a[1], q[1])),
@@ -83,7 +84,8 @@ JOINTS: Mapping[str, tuple[int, Callable[[Array, Any], Pose]]] = {
 SPACE = [
     ("fixed", None), ("revolute", None), ("revolute", [1, 2, -2]), ("revolute", [-1, 0, 0]),
     ("revolute", [0, 0, -2]), ("prismatic", [1, 2, -2]), ("prismatic", [0, -1, 0]),
-    ("planar", None), ("cylindrical", None), ("cylindrical", [2, -1, 2]), ("universal", None),
+    ("planar", None), ("cylindrical", None), ("cylindrical", [2, -1, 2]), ("screw", None),
+    ("screw", [2, -1, 2]), ("universal", None),
     ("universal", [[0, 0, 1], [0.6, 0, 0.8]]), ("spherical", None), ("free", None),
 ]  # fmt: skip
 PLANE = [("fixed", None), ("revolute", None), ("prismatic", [-0.6, 0.8]), ("planar", None)]
@@ -117,6 +119,8 @@ class Arm:
                 **inertia_keys(self.points[1], plane), **more.pop("keys", {})}  # fmt: skip
         if axis is not None:
             tool["axis"] = axis
+        if joint == "screw":
+            tool["pitch"] = PITCH
         gravity = GRAVITY[: self.wide].tolist()
         text = trees.text([base, tool], gravity, {"k": 30.0, "c": 0.7}, more.pop("tables", ()))
         self.system = from_scene(parse(text, "arm.toml"))
@@ -188,7 +192,13 @@ def test_energies_of_a_joint_agree_with_point_masses(joint: str, axis: Any, plan
 
 @pytest.mark.parametrize(
     ("joint", "plane"),
-    [("revolute", False), ("cylindrical", False), ("free", False), ("prismatic", True)],
+    [
+        ("revolute", False),
+        ("cylindrical", False),
+        ("screw", False),
+        ("free", False),
+        ("prismatic", True),
+    ],
 )
 def test_forces_along_a_joint_have_the_right_sign(joint: str, plane: bool) -> None:
     """Damping and friction oppose the velocity; drives act along the coordinate."""

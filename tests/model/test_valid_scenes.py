@@ -8,8 +8,7 @@ import pytest
 
 import eomc
 from eomc.base.errors import EomcError, SceneError
-from eomc.model.from_scene import from_scene
-from eomc.model.system import System
+from eomc.model.system import System, from_scene
 from eomc.scene.read import parse
 from eomc.verify.check import check
 

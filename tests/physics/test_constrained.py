@@ -12,18 +12,18 @@ from functools import cache
 from types import ModuleType
 from typing import Any
 
-import constrained
 import numpy as np
 import pytest
-from conftest import ROOT, tiers
+from support import constraint_cases
+from support.session import ROOT, tiers
 
 import eomc
-from eomc.program.assembly import assembled
+from eomc.mechanism.assembly import assembled
 
 pytestmark = pytest.mark.usefixtures("unoptimised_file")
 BUILT = ROOT / "build" / "tests" / "constrained"
-NAMES = list(constrained.cases())
-MEASURED = [name for name in NAMES if constrained.cases()[name]["rk4_measured"]]
+NAMES = list(constraint_cases.cases())
+MEASURED = [name for name in NAMES if constraint_cases.cases()[name]["rk4_measured"]]
 QUICK = ("pendulum_over_the_top",)
 FLAT = ("iftomm_A02_four_bar_N1", "iftomm_A02_four_bar_N2", "parallelogram_redundant_bar")
 ALIKE = 1.5  # times the error of the independent RK4
@@ -32,7 +32,7 @@ ALIKE = 1.5  # times the error of the independent RK4
 @cache
 def module(name: str) -> ModuleType:
     """Load a case from its guessed initial values, with rk4 and dp8."""
-    system = constrained.system(name, "guess", redundant=False)
+    system = constraint_cases.system(name, "guess", redundant=False)
     run = replace(system.run, methods=("rk4", "dp8"))
     system = replace(system, name=f"case_{name.lower()}", run=run, digest=f"constrained {name}")
     return eomc.load(assembled(system), BUILT)
@@ -47,23 +47,24 @@ def simulate(name: str, **how: Any) -> Any:
 
 @pytest.mark.parametrize("name", tiers(MEASURED, *QUICK))
 def test_error_of_rk4_is_that_of_an_independent_rk4(name: str) -> None:
-    case = constrained.cases()[name]
+    case = constraint_cases.cases()[name]
     for measured in case["rk4_measured"]:
         steps = measured["steps"]
         run = simulate(name, h=measured["h"], steps=steps, every=steps)
         assert run.status == "ok"
-        error = constrained.error_of(name, run.q[-1])
+        error = constraint_cases.error_of(name, run.q[-1])
         limit = (2 if name in FLAT else ALIKE) * measured["projected"]["err_q"]
         assert error <= limit, (measured["h"], error / measured["projected"]["err_q"])
 
 
 @pytest.mark.parametrize("name", tiers(MEASURED, *QUICK))
 def test_constraints_are_satisfied_at_every_output(name: str) -> None:
-    measured = constrained.cases()[name]["rk4_measured"][-1]
+    measured = constraint_cases.cases()[name]["rk4_measured"][-1]
     run = simulate(name, h=measured["h"], steps=measured["steps"], every=5)
     own = module(name)
     scale = np.max(np.abs(run.q)) + 1
-    off = own.constraints(run.q, run.qd, run.t)[:, : len(constrained.cases()[name]["constraints"])]
+    rows = len(constraint_cases.cases()[name]["constraints"])
+    off = own.constraints(run.q, run.qd, run.t)[:, :rows]
     assert np.max(np.abs(off), initial=0) <= 1e-13 * scale
     rates = own.constraint_rates(run.q, run.qd, run.t)
     assert np.max(np.abs(rates)) <= 1e-12 * (np.max(np.abs(run.qd)) + 1)
@@ -75,13 +76,13 @@ def test_accelerations_and_multipliers_at_reference_states(name: str) -> None:
     unique.
     """
     own = module(name)
-    q, qd, a, multipliers = constrained.ends(name, "q_ref", "qd_ref", "qdd_ref", "lambda_ref")
-    t = float(constrained.cases()[name]["t_end"])
+    q, qd, a, multipliers = constraint_cases.ends(name, "q_ref", "qd_ref", "qdd_ref", "lambda_ref")
+    t = float(constraint_cases.cases()[name]["t_end"])
     off = np.max(np.abs(own.acceleration(q, qd, t) - a)) / np.max(np.abs(a))
     assert off < 1e-10
     A = own.constraint_jacobian(q, t=t)
     computed, expected = own.multipliers(q, qd, t), multipliers
-    if constrained.cases()[name]["redundant"]:
+    if constraint_cases.cases()[name]["redundant"]:
         computed, expected = computed @ A, expected @ A
     np.testing.assert_allclose(computed, expected, rtol=0, atol=1e-10 * np.max(np.abs(expected)))
 
@@ -89,13 +90,13 @@ def test_accelerations_and_multipliers_at_reference_states(name: str) -> None:
 @pytest.mark.parametrize("name", tiers(MEASURED, *QUICK))
 def test_dp8_reaches_eleven_digits(name: str) -> None:
     """The step size is a quarter of the smallest one of RK4."""
-    measured = constrained.cases()[name]["rk4_measured"][-1]
+    measured = constraint_cases.cases()[name]["rk4_measured"][-1]
     steps = 4 * measured["steps"]
     how = {"h": measured["h"] / 4, "steps": steps, "every": steps, "method": "dp8"}
     run = simulate(name, **how)
     moved = simulate(name, **how, q0=module(name).start[0] * (1 + 2.0**-52))
     floor = np.max(np.abs(moved.q[-1] - run.q[-1]))  # effect of rounding the initial state
-    assert constrained.error_of(name, run.q[-1]) <= 1e-11 + 30 * floor
+    assert constraint_cases.error_of(name, run.q[-1]) <= 1e-11 + 30 * floor
 
 
 @pytest.mark.slow
@@ -131,7 +132,7 @@ def test_stages_near_a_singular_position_keep_the_run_accurate(
     name = "iftomm_A02_four_bar_N2"
     for steps in counts:
         run = simulate(name, h=10 / steps, steps=steps, every=steps, method=method)
-        assert run.status == "ok" and constrained.error_of(name, run.q[-1]) < most, steps
+        assert run.status == "ok" and constraint_cases.error_of(name, run.q[-1]) < most, steps
 
 
 @pytest.mark.parametrize("h", tiers([0.05, 0.04, 0.02, 0.01]))

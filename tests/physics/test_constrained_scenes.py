@@ -5,8 +5,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from cases import SCENES
-from conftest import tiers
+from support.cases import SCENES
+from support.session import tiers
 
 import eomc
 

@@ -17,10 +17,10 @@ from types import ModuleType
 import mpmath
 import numpy as np
 import pytest
-from cases import SCENES, scene_text
-from conftest import ROOT, Modules
+from support.cases import SCENES, scene_text
+from support.session import ROOT, Modules
 
-from eomc.model.from_scene import from_scene
+from eomc.model.system import from_scene
 from eomc.report import cost_of_digits, reference_solution
 from eomc.scene.read import parse
 

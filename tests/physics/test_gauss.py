@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 import sympy
-from cases import cases, fast_kit, scene_file, scene_text, variant
-from conftest import MODULES, Modules, tiers
+from support.cases import cases, fast_kit, scene_file, scene_text, variant
+from support.session import MODULES, Modules, tiers
 
 import eomc
 from eomc.integrators import tableaux
 from eomc.integrators.tableaux import METHODS
-from eomc.model.from_scene import from_scene
+from eomc.model.system import from_scene
 from eomc.scene.read import parse
 from eomc.verify.check import check
 
@@ -61,7 +61,8 @@ def count_evaluations(
         r"long evaluations;\n\1\n    evaluations++;", files[f"{name}.c"], count=1,
     )  # fmt: skip
     assert "evaluations++" in source
-    args = "q, qd, 0, " if re.search(rf"{name}_{method}_step\([^)]*\bt,", source) else "q, qd, "
+    several = len(system.run.methods) > 1
+    choice = f"    options.method = {name.upper()}_METHOD_{method.upper()};" if several else ""
     folder = Path("build/tests") / f"counted_{name}"
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.h").write_text(files[f"{name}.h"], encoding="utf-8")
@@ -73,10 +74,13 @@ extern long evaluations;
 int main(void)
 {{
     double q[{n}], qd[{n}];
+    {name}_options options = {{ .h = {h!r}, .steps = {steps} }};
+    {name}_output output = {{ 0 }};
     {name}_status status;
     for (int i = 0; i < {n}; i++)
         q[i] = {name}_q0[i], qd[i] = {name}_qd0[i];
-    {name}_{method}_run({args}{h!r}, 0, {steps}, 0, NULL, NULL, &{name}_defaults, NULL, &status);
+{choice}
+    status = {name}_integrate(q, qd, &{name}_defaults, &options, &output);
     printf("%ld %d", evaluations, (int)status);
     for (int i = 0; i < {n}; i++)
         printf(" %.17g %.17g", q[i], qd[i]);

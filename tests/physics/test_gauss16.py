@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cases import cases, scene_file, scene_text, variant
-from conftest import MODULES, tiers
+from support.cases import cases, scene_file, scene_text, variant
+from support.session import MODULES, tiers
 
 import eomc
 from eomc.integrators import tableaux
 from eomc.integrators.tableaux import GAUSS16
+from eomc.verify import convergence
 from eomc.verify.check import check
 from eomc.verify.comparison import Comparison
 
@@ -103,13 +104,13 @@ def test_five_iterations_are_stable_where_they_suffice() -> None:
 
 
 def test_order(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With an input and its signal, compared with rk4."""
-    monkeypatch.setattr(Comparison, "add_advice_check", lambda *_: None)
+    """With an input and its signal."""
+    monkeypatch.setattr(convergence, "advice_checks", lambda *_: ())
     path = driven()
     comparison = Comparison(eomc.read(path), eomc.load(path, MODULES), np.random.default_rng(0), 4)
-    comparison.add_convergence_checks()
-    assert [row for row in comparison.results if not row.passed] == []
-    assert {"order of gauss16", "rk4 beside gauss16"} <= {row.name for row in comparison.results}
+    results = comparison.report(convergence.checks)
+    assert [row for row in results if not row.passed] == []
+    assert {"order of gauss16", "order of rk4"} <= {row.name for row in results}
 
 
 @pytest.mark.slow
@@ -119,7 +120,7 @@ def test_order_by_check(name: str) -> None:
     path = variant(name, f"g16_check_{name}", method='["rk4", "gauss16"]')
     report = check(eomc.read(path), eomc.load(path, MODULES))
     assert [row for row in report.results if not row.passed] == []
-    assert {"order of gauss16", "gauss16 beside rk4"} <= {row.name for row in report.results}
+    assert {"order of gauss16", "run by gauss16"} <= {row.name for row in report.results}
 
 
 @pytest.mark.slow

@@ -6,8 +6,8 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from cases import SCENES
-from conftest import Modules
+from support.cases import SCENES
+from support.session import Modules
 
 import eomc
 

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cases import ALIKE, case_system, cases, error_of
-from conftest import ROOT, Modules, tiers
+from support.cases import ALIKE, case_system, cases, error_of
+from support.session import ROOT, Modules, tiers
 
 from eomc.report import cost_of_digits
 

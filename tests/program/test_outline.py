@@ -13,21 +13,20 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from builds import REUSED_BUILDS
-from cases import SCENES, fast_kit, scene_system
-from compilers import STRICT, compiled
-from conftest import EVERYTHING, Modules, needs, tiers
+from support.builds import REUSED_BUILDS
+from support.cases import SCENES, fast_kit, scene_system
+from support.compilation import STRICT, compiled
+from support.session import EVERYTHING, Modules, needs, tiers
 from sympy import S
 
 import eomc
 from eomc.derive import lagrange
 from eomc.derive.tape import Stage
 from eomc.emit.render import Sources, render
-from eomc.model import from_scene as system
+from eomc.model import system
 from eomc.model.symbols import ALONG
 from eomc.model.system import System
 from eomc.program import outline, program
-from eomc.program.interpret import evaluate, nearby
 from eomc.program.ir import (
     Assignment,
     Call,
@@ -36,6 +35,8 @@ from eomc.program.ir import (
     Operand,
     Product,
     Sum,
+    evaluate,
+    nearby,
     rename,
 )
 from eomc.program.program import Program
@@ -401,6 +402,7 @@ def test_matrices_by_columns_agree_with_whole_matrices(
 # --- names ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_parameters_with_names_of_directions_are_accepted(root: Path) -> None:
     """Entries of a direction, for D and the Jacobian, have names that no scene can have."""
     text = """

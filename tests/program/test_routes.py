@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import ast
 import math
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-from cases import scene_system
+from support.cases import scene_system
 
 from eomc.derive.lagrange import derive
 from eomc.derive.ldl import Solution
 from eomc.program import routes
-from eomc.program.interpret import evaluate, nearby
-from eomc.program.ir import Cost, Function
+from eomc.program.ir import evaluate, nearby
 from eomc.program.lower import lower
 from eomc.program.routes import ROUTES, RouteInputs
 
@@ -101,10 +99,7 @@ def test_no_other_file_compares_names_of_routes() -> None:
     assert not compared
 
 
-def test_states_without_a_result_of_any_route_are_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_states_without_a_result_of_any_route_are_ignored() -> None:
     errors = {"one": [math.inf, *[1e-16] * 3, 3e-16], "other": [math.inf, *[1e-16] * 3, math.inf]}
-    monkeypatch.setattr(routes, "_errors", lambda function, *_: errors[function.name])
-    empty = Function("", (), (), (), (), Cost(), "", ())
-    function = {name: replace(empty, name=name) for name in errors}
-    roundings = routes._roundings(function, scene_system("cartpole"))
-    assert roundings == {"one": 3e-16, "other": math.inf}
+    assert routes.largest_errors(errors) == {"one": 3e-16, "other": math.inf}
+    assert routes.largest_errors({"one": [math.inf]}) == {"one": 0.0}

@@ -12,18 +12,18 @@ from types import ModuleType
 import mpmath
 import numpy as np
 import pytest
-from cases import FMA, SCENES, fast_kit, scene_system
-from compilers import compiled
-from conftest import Modules, needs, tiers
+from support.cases import FMA, SCENES, fast_kit, scene_system
+from support.compilation import compiled
+from support.session import Modules, needs, tiers
 from sympy import S
 
 import eomc
 from eomc.derive import lagrange
 from eomc.derive.tape import Stage
-from eomc.emit.c_expression import DOUBLE
-from eomc.emit.c_names import Target
+from eomc.emit.common.c_expression import DOUBLE
+from eomc.emit.common.c_names import Target
 from eomc.emit.optimised.lanes import Accelerations
-from eomc.model import from_scene as system
+from eomc.model import system
 from eomc.program import program, two_point
 from eomc.program.ir import Assignment, Operand, Product, Sum
 from eomc.scene import read as scene
@@ -394,19 +394,22 @@ static void dirt(void)
     memcpy(q, dirt_odd_q0, sizeof q);
     memcpy(qd, dirt_odd_qd0, sizeof qd);
 }
-#define TRY(method) \\
+#define TRY(name) \\
     dirt(); \\
-    ended |= dirt_odd_##method##_run(q, qd, 0, 0.005, 0, 9, 0, 0, 0, 0, 0, &dirt_odd_defaults, 0, \\
-        &status) != 9
+    options.method = DIRT_ODD_METHOD_##name; \\
+    output.steps = 0; \\
+    ended |= dirt_odd_integrate(q, qd, 0, &dirt_odd_defaults, &options, &output) != DIRT_ODD_OK; \\
+    ended |= output.steps != 9
 int main(void)
 {
-    dirt_odd_status status;
+    dirt_odd_options options = { .h = 0.005, .steps = 9 };
+    dirt_odd_output output = { 0 };
     int ended = 0;
 
-    TRY(rk4);
-    TRY(dp8);
-    TRY(gauss8);
-    TRY(gauss16);
+    TRY(RK4);
+    TRY(DP8);
+    TRY(GAUSS8);
+    TRY(GAUSS16);
     return ended;
 }
 """

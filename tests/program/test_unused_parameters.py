@@ -8,8 +8,7 @@ import sympy
 
 from eomc import pipeline
 from eomc.base.errors import Problem
-from eomc.model.from_scene import from_scene
-from eomc.model.system import System
+from eomc.model.system import System, from_scene
 from eomc.scene import read
 
 SCENE = """eomc = 1

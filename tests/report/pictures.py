@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from eomc.robots import edit, preparation, scene_text, urdf
+from eomc.robots import edit, scene_text, urdf
 from eomc.scene.read import parse, read
 from eomc.scene.scene import Scene
 
@@ -38,7 +38,7 @@ def scene(name: str) -> Scene:
 def robot(file: Path, free: bool = False) -> Scene:
     """Return the scene of a URDF as eomc import writes it."""
     model = edit.with_nearest_inertias(edit.with_base(urdf.read(file), free))
-    return parse(scene_text.scene_text(preparation.prepare_for_scene(model)))
+    return parse(scene_text.scene_text(scene_text.prepare_for_scene(model)))
 
 
 def robot_data(name: str) -> Path:
@@ -53,7 +53,7 @@ def robot_data(name: str) -> Path:
 def system(model: Scene, title: str = "") -> Any:
     """Return the attributes of a System that pictures use."""
     return SimpleNamespace(
-        scene=model, picture_scene=None, name=model.name, title=title or model.title, outputs=(),
+        scene=model, name=model.name, title=title or model.title, outputs=(),
         coordinates=model.coordinates, parameters=(*model.parameters,), inputs=(),
         q=model.coordinates, discrete=(),
     )  # fmt: skip

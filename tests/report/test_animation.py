@@ -7,16 +7,16 @@ import os
 import re
 from types import SimpleNamespace
 
-import batches
 import numpy as np
 import pytest
 from report.pictures import SCENES, chain, humanoid, motion, scene, system
+from support import trajectories
 
 from eomc.base.errors import EomcError
 from eomc.report import animation
 from eomc.report.drawing import draw_mechanism
 from eomc.report.style import html_name
-from eomc.report.timeline import Timeline, choose_instances, find_system, select_instances
+from eomc.report.timeline import Timeline, choose_instances, find_system
 
 EVIL = "</script><img src=x onerror=alert(1)>"
 
@@ -187,7 +187,7 @@ def test_unsuitable_suffixes_and_folders_are_reported(tmp_path):
 @pytest.fixture(scope="module")
 def batch():
     """Return ten poles of different lengths; one of them stops half way."""
-    runs = batches.module("cartpole").simulate_batch(
+    runs = trajectories.module("cartpole").simulate_batch(
         steps=400, params={"l": np.linspace(1.0, 3.0, 10)}
     )
     runs.q[9, 200:], runs.qd[9, 200:], runs.status_codes[9] = np.nan, np.nan, 1
@@ -209,7 +209,7 @@ def test_instances_of_a_batch_are_overlaid(batch, tmp_path):
     assert {*d["whose"]} == {0, 1, 2} and len(d["whose"]) == len(d["marks"])
     assert [(name, instance) for name, _, instance in d["paths"]] == [("0", 0), ("4", 1), ("9", 2)]
     moving, rows = values(d["moving"], (-1, d["count"], 2)), rows_of(batch, text)
-    fifth = find_system(batch).with_parameters({"l": batch.parameter_values[4, 2]})
+    fifth = find_system(batch).with_parameters({"l": batch.request.p[4, 2]})
     drawing = draw_mechanism(fifth, batch.t[rows], batch.q[4, rows])
     (own,) = [k for name, k, _ in d["paths"] if name == "4"]
     path = drawing.points[:, drawing.paths[0].point]
@@ -270,7 +270,7 @@ def test_adaptive_batch_is_animated_at_its_times(modules):
 def test_batch_is_written_as_a_film(batch, tmp_path):
     pytest.importorskip("matplotlib")
     image = pytest.importorskip("PIL.Image")
-    short = select_instances(batch, [0, 5])
+    short = batch.select([0, 5])
     short.q, short.qd = short.q[:, :11], short.qd[:, :11]
     short.animate(tmp_path / "b.gif")
     with image.open(tmp_path / "b.gif") as image_file:
@@ -393,6 +393,7 @@ y_dot = "-0.8*y_dot"
 points = { ball = ["x - X0", "y"] }
 dots = ["ball"]
 [run]
+tolerance = 1e-9
 h = 0.01
 duration = 2.0
 """
@@ -403,6 +404,7 @@ def ball(modules):
     return modules.unoptimised(BOUNCING)
 
 
+@pytest.mark.slow
 def test_adaptive_runs_are_interpolated_with_both_rows_of_a_jump(ball):
     run = ball.simulate(tol=1e-9, duration=2.0)
     run_data = data(run.animate().page)["runs"][0]

@@ -5,11 +5,10 @@ import time
 from itertools import pairwise
 from pathlib import Path
 
-import batches
-import browser
 import numpy as np
 import pytest
 from report.pictures import chain, humanoid, motion, scene, system
+from support import browser, trajectories
 
 from eomc.report import animation
 from eomc.report.timeline import BatchTimeline, Timeline, find_system
@@ -181,7 +180,7 @@ def test_runs_are_shown_side_by_side_at_one_time(open_page):
 
 def poles(count):
     """Return a batch of `count` cart-poles that swing from different heights."""
-    module = batches.module("cartpole")
+    module = trajectories.module("cartpole")
     q0 = np.column_stack([0.1 * np.arange(count), np.linspace(0.5, 3.0, count)])
     runs = module.simulate_batch(q0, steps=400)
     return [BatchTimeline(find_system(runs), runs, (), count)]

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 import pytest
 import sympy
-from cases import SCENES, case_system
 from click.testing import CliRunner
-from conftest import ROOT, needs
+from support.cases import SCENES, case_system
+from support.session import ROOT, needs
 
 from eomc import pipeline
 from eomc.base.errors import EomcError
@@ -26,8 +26,8 @@ from eomc.cli.main import main
 from eomc.emit.render import Sources
 from eomc.integrators.tableaux import METHODS
 from eomc.model.system import Event, System
-from eomc.report import cost_of_digits, overview, page
-from eomc.report.cost_of_digits import WorkPrecisionPoint, WorkPrecisionReport
+from eomc.report import cost_of_digits, page, typeset
+from eomc.report.cost_of_digits import WorkPrecisionReport
 
 REPORTS = ROOT / "build" / "tests" / "reports"
 OSCILLATING = """eomc = 1
@@ -236,7 +236,7 @@ def test_page_is_written_without_matplotlib_and_latex2mathml(
 ) -> None:
     for name in ("matplotlib", "matplotlib.figure", "latex2mathml", "latex2mathml.converter"):
         monkeypatch.setitem(sys.modules, name, None)
-    overview._convert.cache_clear()
+    typeset._convert_to_mathml.cache_clear()
     monkeypatch.setattr(cost_of_digits, "measure", lambda *_, **__: measured())
     scene = tmp_path / "oscillating.toml"
     scene.write_text(OSCILLATING)
@@ -248,7 +248,7 @@ def test_page_is_written_without_matplotlib_and_latex2mathml(
     )
     text = (tmp_path / "oscillating" / "report.html").read_text()
     assert "The page has no pictures, which need matplotlib" in text
-    assert "K, kinetic energy:" in text  # the equations as text
+    assert "kinetic energy:" in text  # the equations as text
     assert "<figure" not in text and "Motion</h2>" not in text
     assert all(words in text for words in page.recommendations(measured()))
 
@@ -271,22 +271,11 @@ def test_measurements_as_json() -> None:
 
 
 @pytest.mark.parametrize(("mode", "steps"), [(0.0, 8), (10j, 128)])
-def test_first_steps_are_few_per_revolution(
-    mode: complex, steps: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_first_steps_are_few_per_revolution(mode: complex, steps: int) -> None:
     """At most 12 radians, a quarter of that for safety; eight steps for a motion without modes."""
-    step_counts, like = [], measured().lines[0].points[0]
-
-    def record_steps(
-        _: object, __: object, name: str, duration: float, steps: int
-    ) -> WorkPrecisionPoint:
-        step_counts.append(steps)
-        return replace(like, seconds=math.inf)
-
-    monkeypatch.setattr(cost_of_digits, "_point", record_steps)
-    unused: Any = None
-    cost_of_digits._line(unused, unused, "gauss8", np.array([mode, -mode]), 400.0, 1.0)
-    assert step_counts == [steps]
+    values = np.array([mode, -mode])
+    stable_to = cost_of_digits.stable_step(values, METHODS["gauss8"].limits)
+    assert cost_of_digits.fewest_steps(values, stable_to, 400.0) == steps
 
 
 def test_stepper_without_a_digit_is_omitted_from_the_energy_figure() -> None:

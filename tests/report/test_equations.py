@@ -1,6 +1,7 @@
 """Equations in textbook form: correct, in order, in lines of at most 100 columns."""
 
 import json
+import pickle
 import re
 import resource
 import shutil
@@ -13,8 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 import sympy
-from cases import SCENES
 from click.testing import CliRunner
+from support.cases import SCENES
 from sympy import Eq, cos, sin, symbols
 from sympy.printing.pretty.stringpict import stringPict
 
@@ -22,7 +23,7 @@ import eomc
 from eomc import pipeline
 from eomc.cli.main import main
 from eomc.model.symbols import symbol
-from eomc.report.equations import derive, write_latex
+from eomc.report.equations import derive
 from eomc.report.equations_text import write_equations
 from eomc.report.typeset import Typesetter
 from eomc.runtime.labels import tex
@@ -68,7 +69,7 @@ def test_inputs_are_on_the_right_and_friction_on_the_left() -> None:
     x, v, a = symbols("x x_dot x_ddot", real=True)
     assert sympy.expand(equation.lhs - (m * a + c * v + k * x)) == 0
     assert sympy.expand(equation.rhs - (F - k_3 * x**3)) == 0
-    assert r"& m \ddot{x} + c \dot{x} + k x = F - k_{3} x^{3}" in write_latex(derive(system))
+    assert r"& m \ddot{x} + c \dot{x} + k x = F - k_{3} x^{3}" in write_equations(system, "latex")
     text = unicodedata.normalize("NFC", str(derive(system)))
     assert unicodedata.normalize("NFC", "m⋅ẍ + c⋅ẋ + k⋅x = F - k₃⋅x") in text
 
@@ -83,7 +84,7 @@ def test_decimals_of_a_scene_are_printed_as_decimals() -> None:
     """0.028, not 7/250; a third and an eighth are printed as fractions."""
     potential = "0.0125*x**2/2 + 0.007*x*(1 + m) - m*sin(x)/400 + x**3/8"
     system = eomc.System.make("a", ["x"], "m*x_dot**2/6", potential, parameters={"m": 1})
-    text, latex = (form(derive(system)) for form in (str, write_latex))
+    text, latex = (write_equations(system, form) for form in ("text", "latex"))
     assert "- 0.0025⋅m⋅cos(x) = 0" in text and "0.007 + 0.007⋅m + 0.0125⋅x" in text
     assert r"- 0.0025 m \cos {x} = 0" in latex and r"\frac{3 x^{2}}{8}" in latex
     match = re.search(r"P &= (.*) \\\\\n  L &= (.*)", latex)
@@ -147,7 +148,7 @@ def test_scalar_equations_agree_with_reference(file: Path) -> None:
 
 
 def test_terms_are_ordered_as_in_a_textbook() -> None:
-    latex = write_latex(derive(pipeline.read(SCENES / "spring_pendulum.toml")))
+    latex = write_equations(pipeline.read(SCENES / "spring_pendulum.toml"), "latex")
     assert (
         r"& m \ddot{r} - m r \dot{\theta}^{2} + k \left(r - l_{0}\right) - m g \cos {\theta} = 0"
         in latex
@@ -400,3 +401,58 @@ def test_only_fractions_equal_to_the_double_are_printed() -> None:
     text = str(derive(system))
     assert "2.6666" not in text and "[8/3]" in text
     assert "0.3333333333333" in text  # which is not a third
+
+
+@pytest.mark.parametrize(
+    ("form", "fraction"),
+    [("text", "[8/3]"), ("latex", r"\frac{8}{3}"), ("python", "Rational(8, 3)")],
+)
+def test_all_forms_print_a_float_as_the_same_fraction(form: str, fraction: str) -> None:
+    text = write_equations(eomc.System.make("a", ["x"], f"{8 / 3!r}*x_dot**2/2", "0"), form)
+    assert fraction in text and "2.666" not in text
+
+
+def test_floats_are_printed_as_the_fractions_that_round_to_them() -> None:
+    x, v, m = symbols("x x_dot m")
+    system = eomc.System.make(
+        "a", [x], 8 / 3 * m * v**2 / 2, 0.3333333333333 * m * x + 0.7 * x**2, parameters={m: 1}
+    )
+    equations = eomc.equations(system)
+    text = str(equations)
+    assert "2.6666" not in text and "0.3333333333333" in text and "1.4⋅x" in text
+    assert r"\frac{8 m \ddot{x}}{3}" in equations._repr_latex_()
+    assert equations.D.atoms(sympy.Float)  # the expressions themselves are as they were
+    assert equations.with_values(m=8 / 3).D[0] == pytest.approx(64 / 9, rel=1e-15)
+    plain = eomc.System.make("b", ["x"], "m*x_dot**2/2", "0", parameters={"m": 1})
+    assert eomc.equations(plain).with_values(m=8 / 3).D[0] == sympy.Rational(8, 3)
+    assert eomc.equations(plain).with_values(m=0.3).D[0] == sympy.Rational(3, 10)
+
+
+def test_each_equation_is_printed_and_typeset_by_itself() -> None:
+    equations = eomc.equations(SCENES / "spring_pendulum.toml")
+    first, second, kinetic, *_ = equations.equations
+    assert (first.left - first.right).equals(equations.scalar[0].lhs)
+    assert first.title == second.title == "equations of motion"
+    latex = r"m \ddot{r} - m r \dot{\theta}^{2} + k \left(r - l_{0}\right) - m g \cos {\theta} = 0"
+    assert first._repr_latex_() == "\\begin{align*}\n  & " + latex + "\n\\end{align*}"
+    assert (kinetic.left, kinetic.right) == (sympy.Symbol("K"), equations.kinetic)
+    assert str(kinetic).strip() in re.sub("^    ", "", str(equations), flags=re.MULTILINE)
+    assert repr(kinetic).startswith("<Equation K = ") and len(repr(kinetic)) < 80
+    (mass_matrix,) = (e for e in equations.equations if e.title == "mass matrix")
+    assert repr(mass_matrix) == "<Equation D = a matrix (2, 2)>"
+    assert equations.D._repr_latex_() == mass_matrix._repr_latex_()
+    assert r"D &= \left[\begin{matrix}m & 0\\0 & m r^{2}" in equations.D._repr_latex_()
+    assert (2 * equations.D)._repr_latex_().startswith("$")  # by SymPy, since it is no part
+    assert pickle.loads(pickle.dumps(equations.D)) == equations.D
+
+
+def test_rows_of_a_system_in_functions_of_time_are_typeset() -> None:
+    from sympy.physics.mechanics import dynamicsymbols
+
+    theta, m = dynamicsymbols("theta"), sympy.Symbol("m", positive=True)
+    system = eomc.System.make(
+        "a", [theta], m * theta.diff() ** 2 / 2, m * theta**2, parameters={m: 1}
+    )
+    (row, *_) = eomc.equations(system).equations
+    assert row.left.has(theta.diff(dynamicsymbols._t, 2))
+    assert r"m \ddot{\theta} + 2 m \theta = 0" in row._repr_latex_()

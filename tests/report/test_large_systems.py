@@ -14,15 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 import sympy
-from cases import SCENES
-from conftest import EVERYTHING
 from report import pictures
+from support.cases import SCENES
+from support.session import EVERYTHING
 
 import eomc
 from eomc import pipeline
 from eomc.base.errors import EomcError
-from eomc.model.from_scene import from_scene
-from eomc.model.system import System
+from eomc.model.system import System, from_scene
 from eomc.model.tree import Tree
 from eomc.report import equations_text
 from eomc.report.equations import Equations, derive
@@ -218,15 +217,15 @@ def evaluate_printed_recursion(
         rate = sum(sympy.diff(link.q, x) * v for x, v in zip(system.q, system.qd, strict=True))
         curved = sum(sympy.diff(rate, x) * v for x, v in zip(system.q, system.qd, strict=True))
         s, R, e = number(link.q), np.reshape(numbers(link.rotation), (3, 3)), np.eye(3)[link.axis]
-        r = numbers(link.offset) + (0 if link.turns else R @ e * s)
-        R = R @ rotation_matrix(link.axis, s) if link.turns else R
+        r = numbers(link.offset) + R @ e * s * number(link.linear)
+        R = R @ rotation_matrix(link.axis, s) if link.angular else R
         J = np.diag(numbers(link.inertia[:3]))
         for k, (i, j) in enumerate(((0, 1), (0, 2), (1, 2))):
             J[i, j] = J[j, i] = number(link.inertia[3 + k])
         c, m = cross_matrix(numbers(link.moment)), number(link.mass)
         X.append(np.block([[R.T, np.zeros((3, 3))], [-R.T @ cross_matrix(r), R.T]]))
         body.append(np.block([[J, c], [-c, m * np.eye(3)]]))
-        S.append(np.concatenate([e, 0 * e] if link.turns else [0 * e, e]))
+        S.append(np.concatenate([e * number(link.angular), e * number(link.linear)]))
         up = np.zeros(6) if link.parent < 0 else v[link.parent]
         v.append(X[-1] @ up + S[-1] * (ds @ qd))
         w, u = cross_matrix(v[-1][:3]), cross_matrix(v[-1][3:])

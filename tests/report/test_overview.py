@@ -6,17 +6,17 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-import browser
 import pytest
-from conftest import ROOT, needs
-from payloads import PAYLOADS
+from support import browser
+from support.payloads import PAYLOADS
+from support.session import ROOT, needs
 
 from eomc import pipeline
 from eomc.base import texts
 from eomc.base.errors import EomcError
-from eomc.model.from_scene import from_scene
-from eomc.model.system import System
-from eomc.report import cost_of_digits, equations, overview, page
+from eomc.model.system import System, from_scene
+from eomc.report import cost_of_digits, equations, page, typeset
+from eomc.report.typeset import write_mathml
 from eomc.scene.read import parse
 
 pytest.importorskip("matplotlib")
@@ -70,18 +70,18 @@ def system() -> System:
 def page_text() -> str:
     needs("gcc")
     report = cost_of_digits.measure(system(), REPORTS, longest=0.005, methods=("rk4", "dp8"))
-    return page.write_page(report, overview.describe_scene(system(), report, REPORTS))
+    return page.write_page(report, page.describe_scene(system(), report, REPORTS))
 
 
 def test_equations_are_written_as_mathml() -> None:
-    first, rest = overview.write_mathml(equations.derive(system()))
+    first, rest = map(write_mathml, equations.derive(system()).groups)
     ((more, line),) = first
     assert not more and line.startswith("<math") and 'displaystyle="true"' in line
     assert "<mi>k</mi>" in line and "push" in re.sub("<[^>]+>", "", line)
     symbols = [re.sub("<[^>]+>", "", line)[0] for _, line in rest[:6]]
     assert symbols == ["K", "P", "L", "D", "C", "g"]
     swing = equations.derive(pipeline.read(ROOT / "scenes" / "furuta_pendulum.toml"))
-    first, _ = overview.write_mathml(swing)
+    first = write_mathml(swing.groups[0])
     assert [more for more, _ in first] == [False, True, False]
     assert '<mo lspace="0.17em" rspace="0.17em">sin</mo>' in first[0][1]
 
@@ -91,9 +91,9 @@ def test_equations_without_latex2mathml_name_the_package(
 ) -> None:
     for name in [name for name in sys.modules if name.startswith("latex2mathml")]:
         monkeypatch.setitem(sys.modules, name, None)
-    overview._convert.cache_clear()
+    typeset._convert_to_mathml.cache_clear()
     with pytest.raises(EomcError, match="need latex2mathml: pip install latex2mathml"):
-        overview.write_mathml(equations.derive(system()))
+        write_mathml(equations.derive(system()).equations)
 
 
 @pytest.mark.slow
@@ -119,7 +119,7 @@ def test_large_scene_states_how_it_is_computed(
     chain = pipeline.read(ROOT / "scenes" / "chain.toml")
     chain = replace(chain, run=replace(chain.run, duration=0.2))
     report = cost_of_digits.measure(chain, REPORTS, longest=0.002, methods=("rk4",))
-    about = overview.describe_scene(chain, report, REPORTS)
+    about = page.describe_scene(chain, report, REPORTS)
     assert not about.equations and "link2 on link1: turns about z" in about.text
     assert '<pre tabindex="0">Chain of links' in page.write_page(report, about)
 
@@ -127,12 +127,10 @@ def test_large_scene_states_how_it_is_computed(
 @pytest.mark.parametrize("name", ["page", "latex", "escape", "attribute"])
 def test_free_text_is_escaped(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     text = PAYLOADS[name]
-    monkeypatch.setattr(overview, "_motion", lambda *_: ("", ""))
+    monkeypatch.setattr(page, "without_pictures", lambda: "no pictures")
     model = system()
     with_note = replace(model.coordinates[0], unit=text, note=text)
-    about = overview.describe_scene(
-        replace(model, note=text, coordinates=(with_note,)), None, Path()
-    )  # type: ignore[arg-type]
+    about = page.describe_scene(replace(model, note=text, coordinates=(with_note,)), None, Path())  # type: ignore[arg-type]
     assert about.note == texts.html(texts.flat(text))
     assert about.coordinates[0][2:] == (texts.html(texts.flat(text)),) * 2
 
@@ -169,7 +167,7 @@ def test_motion_is_drawn_by_adaptive_steps_where_they_are_best(tmp_path: Path) -
     report = cost_of_digits.measure(system, tmp_path, methods=("rk4", "adaptive"), longest=0.01)
     best = report.best(6)
     assert best is not None and best.adaptive
-    assert overview.describe_scene(system, report, tmp_path).caption.startswith(
+    assert page.describe_scene(system, report, tmp_path).caption.startswith(
         f"By steps that fit a tolerance of {best.tol:.0e}, within "
     )
 

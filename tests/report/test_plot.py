@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import sympy
+from support.fake_module import FakeRun
 
 from eomc.base.errors import EomcError
 from eomc.base.names import GREEK
-from eomc.model.from_scene import from_scene
-from eomc.model.system import Input, Output, System, symbol
+from eomc.model.system import Input, Output, System, from_scene, symbol
 from eomc.report import plot
-from eomc.report.plot import RunCurves
 from eomc.runtime.labels import mathtext
 from eomc.scene.read import read
 
@@ -26,7 +25,7 @@ def cartpole():
     system = from_scene(read(SCENES / "cartpole.toml"))
     t = np.linspace(0, 2, 201)
     q = np.column_stack([0.1 * np.sin(t), np.pi / 2 + t])
-    return system, RunCurves(t, q, np.gradient(q, t, axis=0), 5 + 1e-6 * t)
+    return system, FakeRun(system, t, q, np.gradient(q, t, axis=0), 5 + 1e-6 * t)
 
 
 def spring(n=1):
@@ -41,7 +40,7 @@ def spring(n=1):
     )
     t = np.linspace(0, 6, 61)
     q = np.column_stack([np.cos(t)] * n)
-    return system, RunCurves(t, q, np.gradient(q, t, axis=0), np.exp(-t))
+    return system, FakeRun(system, t, q, np.gradient(q, t, axis=0), np.exp(-t))
 
 
 def test_angles_are_wrapped_on_request():
@@ -75,7 +74,7 @@ def test_inputs_and_outputs_have_panels_by_unit_and_size():
     outputs = tuple(Output(name, sympy.S.One, unit) for name, (unit, _) in sizes.items())
     drawn = {name: size * (1 + run.t) for name, (_, size) in sizes.items()}
     system = replace(system, outputs=outputs, inputs=(Input("push", "N"),))
-    run = replace(run, outputs=drawn, inputs={"push": 3 * run.t})
+    run = replace(run, system=system, others={**drawn, "push": 3 * run.t})
     axes = plot.make_figure(system, run).axes[4:-2]
     labels = [r"$\mathrm{push}$ (N)", "outputs (m)", "$y_{2}$ (m)", r"$\mathrm{power}$ (W)"]
     assert [a.get_ylabel() for a in axes] == labels
@@ -113,7 +112,7 @@ def test_discrete_coordinates_have_no_velocity():
     system = replace(system, discrete=("x_3",), coordinates=(
         *system.coordinates[:2], replace(system.coordinates[2], unit="")
     ))  # fmt: skip
-    shown = plot.make_figure(system, run)
+    shown = plot.make_figure(system, replace(run, system=system))
     kinds = [axes.get_ylabel() for axes in shown.axes]
     assert kinds == ["coordinates (m)", "velocities (m/s)", "$x_{3}$", "$E$ (J)"]
 
@@ -135,10 +134,10 @@ def test_jacobi_integral_is_drawn_where_it_differs_from_energy():
     assert axes.get_ylabel() == "$E - E(0)$, $J - J(0)$ (J)" and axes.get_legend()
     assert r"Jacobi's integral: max $|J - J(0)|$ = $1\times10^{-9}$ J" in axes.get_title()
     words = "forces took 2 J; numerical error 1e-09 J"
-    *_, axes, _ = plot.make_figure(system, replace(driven, balance=words)).axes
+    *_, axes, _ = plot.make_figure(system, driven, balance=words).axes
     assert "Jacobi's integral: forces took 2 J\nnumerical error" in axes.get_title()
     assert "Jacobi's integral" in {line.get_label() for line in axes.get_lines()}
-    *_, axes, _ = plot.make_figure(system, replace(run, balance=words)).axes
+    *_, axes, _ = plot.make_figure(system, run, balance=words).axes
     assert axes.get_title().endswith("; forces took 2 J\nnumerical error 1e-09 J")
     axes_of_energy = plot.make_figure(system, replace(driven, energy=0 * energy)).axes[-2]
     assert axes_of_energy.get_ylim()[1] < 1e-8  # with the energy only it would be 1
@@ -195,5 +194,5 @@ def test_unknown_suffixes_and_folders_are_reported(tmp_path, monkeypatch):
 def test_run_of_one_sample_is_drawn():
     for run in (cartpole, spring):
         system, curves = run()
-        first = RunCurves(curves.t[:1], curves.q[:1], curves.qd[:1], curves.energy[:1])
+        first = FakeRun(system, curves.t[:1], curves.q[:1], curves.qd[:1], curves.energy[:1])
         plot.make_figure(system, first)

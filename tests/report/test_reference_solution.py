@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -11,14 +12,16 @@ import mpmath
 import numpy as np
 import pytest
 import sympy
-from cases import case_system, cases
-from conftest import ROOT, needs
+from support.builds import file_states
+from support.cases import case_system, cases
+from support.session import ROOT, needs
 
 import eomc
 from eomc.base.errors import EomcError
-from eomc.emit import c_expression
-from eomc.model.nonsmooth import nonsmooth_functions
+from eomc.emit.common import c_expression
+from eomc.model.mechanics import nonsmooth_functions
 from eomc.model.system import System
+from eomc.program.program import Program
 from eomc.report import reference_solution
 
 REFERENCES = ROOT / "build" / "tests" / "references"
@@ -116,9 +119,10 @@ def test_solution_is_cached_until_initial_values_or_parameters_change(
     solution: reference_solution.ReferenceSolution, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     system = oscillator()
-    with monkeypatch.context() as patch:
-        patch.setattr(reference_solution, "_compute", lambda *a: pytest.fail("computed again"))
-        again = reference_solution.solve(system, rows=8, root=folder)
+    (files,) = folder.iterdir()
+    before = file_states(files)
+    again = reference_solution.solve(system, rows=8, root=folder)
+    assert file_states(files) == before
     np.testing.assert_array_equal(solution.q, again.q)
     np.testing.assert_array_equal(solution.digits, again.digits)
     other = reference_solution.solve(system.with_parameters({"k": 4.0}), rows=8, root=folder)
@@ -126,16 +130,20 @@ def test_solution_is_cached_until_initial_values_or_parameters_change(
 
 
 def test_wrong_accelerations_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    wrong = reference_solution._compile
-    monkeypatch.setattr(
-        reference_solution, "_compile", lambda s, f: wrong(s.with_parameters({"k": 9.0}), f)
-    )
-    original = reference_solution._run
-    monkeypatch.setattr(
-        reference_solution,
-        "_run",
-        lambda e, s, *how: original(e, s.with_parameters({"k": 9.000000001}), *how),
-    )
+    """The executable computes with another stiffness than the plain equations."""
+    right = reference_solution.rename_for_c
+
+    def wrong(program: Program) -> tuple[Program, Mapping[str, str]]:
+        renamed, names = right(program)
+        function = renamed.functions["acceleration"]
+        outputs = tuple(
+            replace(o, coefficient=o.coefficient * (1 + sympy.Rational(1, 10**10)))
+            for o in function.outputs
+        )
+        changed = replace(function, outputs=outputs)
+        return replace(renamed, functions={**renamed.functions, "acceleration": changed}), names
+
+    monkeypatch.setattr(reference_solution, "rename_for_c", wrong)
     with pytest.raises(EomcError, match="agree to 10 digits only"):
         reference_solution.solve(oscillator(), rows=4, root=tmp_path)
 

@@ -6,12 +6,12 @@ import re
 import tomllib
 from pathlib import Path
 
-import mjcf_text
 import numpy as np
 import pytest
+from support import mjcf
 
 import eomc
-from eomc.robots.limits import input_range, intersection
+from eomc.robots.robot import input_range, intersection
 
 INERTIA = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
 URDF = f"""<robot name="pusher"><link name="rail"/>
@@ -43,7 +43,7 @@ LIMITS = {
 }
 
 
-def mjcf(*joints: str) -> str:
+def motors_model(*joints: str) -> str:
     more = {"c": 'actuatorfrcrange="-3 4"', "e": 'actuatorfrcrange="-1 1"'}
     bodies = "".join(HINGE.format(name=name, more=more.get(name, "")) for name in joints)
     return (
@@ -54,7 +54,7 @@ def mjcf(*joints: str) -> str:
 
 def import_scene(folder: Path, text: str, *words: str) -> tuple[str, dict]:
     """Import a robot; return the command's output and the parsed scene."""
-    output, scene = mjcf_text.import_robot(folder, text, *words)
+    output, scene = mjcf.import_robot(folder, text, *words)
     return output, tomllib.loads(scene)
 
 
@@ -82,7 +82,7 @@ def test_with_stops_only_speed_limits_are_notes(tmp_path: Path) -> None:
 
 
 def test_mjcf_limits_apply_before_the_gear(tmp_path: Path) -> None:
-    output, scene = import_scene(tmp_path, mjcf(*"abcdefg"), "--limits")
+    output, scene = import_scene(tmp_path, motors_model(*"abcdefg"), "--limits")
     assert input_limits(scene) == LIMITS
     for words in (
         "limits of drives: 5 of 8 inputs have them, and act within; without are second, idle, odd",
@@ -94,12 +94,12 @@ def test_mjcf_limits_apply_before_the_gear(tmp_path: Path) -> None:
     law = "servo_kp*(servo - 2*d)"
     assert scene["definitions"]["servo_force"] == f"min(max({law}, -7), 7)"
     (tmp_path / "free").mkdir()
-    scene = import_scene(tmp_path / "free", mjcf(*"abcdefg"))[1]
+    scene = import_scene(tmp_path / "free", motors_model(*"abcdefg"))[1]
     assert scene["definitions"]["servo_force"] == law and not input_limits(scene)
 
 
 def test_joint_force_range_limits_its_servo(tmp_path: Path) -> None:
-    text = mjcf("d").replace('name="d" ', 'name="d" actuatorfrcrange="-8 20"')
+    text = motors_model("d").replace('name="d" ', 'name="d" actuatorfrcrange="-8 20"')
     servo = re.search("<position.*", MOTORS)[0]
     text = text.replace(MOTORS, servo)
     _, scene = import_scene(tmp_path, text, "--limits")
@@ -130,7 +130,7 @@ def test_input_limits_saturate_inputs(tmp_path: Path, quickly_compiled: None) ->
 def test_forces_equal_those_of_mujoco(tmp_path: Path, quickly_compiled: None) -> None:
     """Compare joint forces for controls within and beyond all ranges."""
     mujoco = pytest.importorskip("mujoco", reason="pip install '.[robots]'")
-    text = mjcf(*"abcd").split('<motor name="first"')[0] + "</actuator></mujoco>"
+    text = motors_model(*"abcd").split('<motor name="first"')[0] + "</actuator></mujoco>"
     import_scene(tmp_path, text, "--limits")
     m = eomc.load(tmp_path / "robot.toml", tmp_path)
     model = mujoco.MjModel.from_xml_string(text)

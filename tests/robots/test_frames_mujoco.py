@@ -24,11 +24,10 @@ from robots.test_robots_mujoco import (
 from eomc.derive.frames import momentum, motions, wrenches
 from eomc.derive.lagrange import inverse_dynamics
 from eomc.derive.tape import Tape
-from eomc.model.from_scene import from_scene
-from eomc.model.system import System
-from eomc.program.interpret import evaluate
+from eomc.model.system import System, from_scene
+from eomc.program.ir import evaluate
 from eomc.program.lower import lower
-from eomc.robots.preparation import prepare_for_scene
+from eomc.robots.scene_text import prepare_for_scene
 from eomc.scene.read import parse
 
 pytestmark = pytest.mark.slow

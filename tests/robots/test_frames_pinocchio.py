@@ -22,7 +22,7 @@ from robots.test_robots_mujoco import (  # noqa: E402
 )
 
 from eomc.derive.lagrange import inverse_dynamics  # noqa: E402
-from eomc.robots.preparation import prepare_for_scene  # noqa: E402
+from eomc.robots.scene_text import prepare_for_scene  # noqa: E402
 
 pytestmark = pytest.mark.slow
 

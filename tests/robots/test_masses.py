@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mjcf_text import import_robot, model
+from support.mjcf import import_robot, model
 
 from eomc.derive.lagrange import derive
-from eomc.model.from_scene import from_scene
+from eomc.model.system import from_scene
 from eomc.program import program
-from eomc.program.interpret import evaluate
+from eomc.program.ir import evaluate
 from eomc.robots.edit import with_masses
 from eomc.robots.robot import Robot
 from eomc.robots.scene_text import scene_text

@@ -9,9 +9,9 @@ import pytest
 
 from eomc.base.errors import EomcError
 from eomc.derive import lagrange
-from eomc.model.from_scene import from_scene
+from eomc.model.system import from_scene
 from eomc.program import program
-from eomc.program.interpret import evaluate
+from eomc.program.ir import evaluate
 from eomc.robots import edit, scene_text, urdf
 from eomc.robots.robot import Robot
 from eomc.scene.read import parse
@@ -148,7 +148,7 @@ def test_mimic_of_a_fixed_joint_is_fixed(tmp_path: Path) -> None:
         ({"far": "<mimic/>"}, "joint far: its <mimic> names no joint"),
         ({"far": '<mimic joint="far"/>'}, "far: joints mimic one another in a ring: far -> far"),
         ({"far": '<mimic joint="thumb"/>', "thumb": '<mimic joint="far"/>'}, "in a ring: "),
-        ({"far": '<mimic joint="near" multiplier="two"/>'}, "multiplier of <mimic>: 'two' is not"),
+        ({"far": '<mimic joint="near" multiplier="two"/>'}, "of <mimic>: 'two' is not"),
         ({"far": '<mimic joint="loose"/>'}, "'loose' is a floating joint, which has 6 coordinates"),
         ({"loose": '<mimic joint="near"/>'}, "loose: it mimics 'near'; 'loose' is a floating"),
     ],

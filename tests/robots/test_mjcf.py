@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mjcf_text import BALL, BODY, CLOSE, PI, model, refused, reported
+from support.mjcf import BALL, BODY, CLOSE, PI, model, refused, reported
 
+from eomc.robots.geometry import IDENTITY
 from eomc.robots.robot import JointMotion, Law
-from eomc.robots.rotations import IDENTITY
 
 # ---- frames and joints
 

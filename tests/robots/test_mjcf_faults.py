@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from mjcf_text import refused
+from support.mjcf import refused
 
 from eomc.base.errors import EomcError, SceneError
 from eomc.cli.main import main as cli
-from eomc.robots.mjcf import read
+from eomc.robots import mjcf
 from eomc.robots.robot import JointMotion
 
 
@@ -103,9 +103,9 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     ):
         file.write_text(text)
         with pytest.raises(EomcError, match=words):
-            read.read(file)
+            mjcf.read(file)
     with pytest.raises(EomcError, match="no such file"):
-        read.read(tmp_path / "none.xml")
+        mjcf.read(tmp_path / "none.xml")
 
 
 def write(folder: Path, **files: str) -> Path:
@@ -125,10 +125,10 @@ def test_included_files_replace_include(tmp_path: Path) -> None:
         arm='<x><body name="a"><include file="joint.xml"/><geom size="0.1"/></body></x>',
         joint='<x><joint ref="0.5"/></x>',
     )
-    (motion,) = read.read(main, include=True).motions
+    (motion,) = mjcf.read(main, include=True).motions
     assert motion == JointMotion("a_joint", "rad", start=0.5, damping=2)
     with pytest.raises(SceneError, match="is not opened"):
-        read.read(main)
+        mjcf.read(main)
 
 
 def test_no_file_outside_the_models_folder_is_opened(tmp_path: Path) -> None:
@@ -141,7 +141,7 @@ def test_no_file_outside_the_models_folder_is_opened(tmp_path: Path) -> None:
         if name == "link.xml":
             (folder / name).symlink_to(secret)
         with pytest.raises(SceneError, match="outside the folder"):
-            read.read(main, include=True)
+            mjcf.read(main, include=True)
 
 
 def test_refused_include_causes_no_further_faults(tmp_path: Path) -> None:
@@ -149,7 +149,7 @@ def test_refused_include_causes_no_further_faults(tmp_path: Path) -> None:
     main = write(tmp_path, main=f'<mujoco><include file="../part.xml"/>{joint}</mujoco>')
     for include, words in ((True, "outside the folder"), (False, "is not opened")):
         with pytest.raises(SceneError, match=words) as fault:
-            read.read(main, include=include)
+            mjcf.read(main, include=include)
         assert "of_the_part" not in str(fault.value)
 
 
@@ -157,14 +157,14 @@ def test_part_of_a_model_is_refused_as_such(tmp_path: Path) -> None:
     main = write(tmp_path, main="<mujocoinclude><body/></mujocoinclude>")
     words = "import the file that includes it, with --include"
     with pytest.raises(SceneError, match=words):
-        read.read(main)
+        mjcf.read(main)
     assert words in CliRunner().invoke(cli, ["import", str(main)]).output
 
 
 def test_missing_or_repeated_include_is_reported(tmp_path: Path) -> None:
     main = write(tmp_path, main='<mujoco><include file="none.xml"/></mujoco>')
     with pytest.raises(SceneError, match=r'no file "none.xml"'):
-        read.read(main, include=True)
+        mjcf.read(main, include=True)
     main = write(tmp_path, main='<mujoco><include file="main.xml"/></mujoco>')
     with pytest.raises(SceneError, match="a second time"):
-        read.read(main, include=True)
+        mjcf.read(main, include=True)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mjcf_text import model, refused, reported
+from support.mjcf import model, refused, reported
 
 from eomc.robots.robot import UNLIMITED, Robot
 
@@ -127,7 +127,7 @@ def test_accelerations_equal_those_of_mujoco(
     from test_robots_mujoco import in_python
 
     from eomc.robots import scene_text
-    from eomc.robots.limits import with_input_limits
+    from eomc.robots.edit import with_input_limits
 
     after = AFTER[: AFTER.index("<equality>")]
     monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings into the working folder

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mjcf_text import CLOSE, PI, model, refused
+from support.mjcf import CLOSE, PI, model, refused
 
 R, H, M = 0.1, 0.2, 3.0  # radius, half length, mass
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from eomc.robots.mjcf import read
+from eomc.robots import mjcf
 from eomc.robots.robot import Robot, RobotBody
-from eomc.scene.assembly import WORLD
 from eomc.scene.joints import JOINTS
+from eomc.scene.scene import WORLD
 
 MUJOCO_REQUIRED = "MuJoCo is what these tests compare with: pip install '.[robots]'"
 mujoco = pytest.importorskip("mujoco", reason=MUJOCO_REQUIRED)
@@ -113,7 +113,7 @@ def compare(path: Path, seed: int = 1) -> Robot:
     """Compare all numbers that both have, and all poses at random coordinates and at the initial
     state.
     """
-    robot = read.read(path)
+    robot = mjcf.read(path)
     model = mujoco.MjModel.from_xml_path(str(path))
     data = mujoco.MjData(model)
     near(robot.gravity, model.opt.gravity, 10.0, "gravity")

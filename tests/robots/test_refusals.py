@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from mjcf_text import import_robot
+from support.mjcf import import_robot
 
 NOTE = "not read of this file, which may be the cause:"
 BALL = '<geom size=".1" pos=".3 0 0"/>'

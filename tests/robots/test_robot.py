@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from eomc.base import names
 from eomc.base.errors import EomcError
-from eomc.robots import edit, inertias, preparation, rotations, scene_text
-from eomc.robots.inertias import Inertia
+from eomc.robots import edit, geometry, scene_text
+from eomc.robots.geometry import Inertia
 from eomc.robots.robot import Drive, JointMotion, Robot, RobotBody, body_pose
 from eomc.scene.read import parse
 
@@ -43,65 +43,65 @@ def rotation_matrix(axis: str, by: float) -> np.ndarray:
 def test_rpy_is_the_product_of_elementary_rotations(roll: float, pitch: float, yaw: float) -> None:
     expected = rotation_matrix("z", yaw) @ rotation_matrix("y", pitch) @ rotation_matrix("x", roll)
     # Entries within 1e-12 of 0 and 1 are rounded to these, in each factor.
-    assert np.allclose(rotations.from_rpy(roll, pitch, yaw), expected, atol=4e-12, rtol=0)
+    assert np.allclose(geometry.from_rpy(roll, pitch, yaw), expected, atol=4e-12, rtol=0)
 
 
 @given(angles, angles, angles)
 def test_decomposed_rotation_is_reproduced_also_at_gimbal_lock(
     a: float, b: float, c: float
 ) -> None:
-    rotation = rotations.from_rpy(a, b, c)
-    turns = rotations.axis_rotations(rotation)
-    again = rotations.from_euler("".join(x for x, _ in turns), [angle for _, angle in turns])
+    rotation = geometry.from_rpy(a, b, c)
+    turns = geometry.axis_rotations(rotation)
+    again = geometry.from_euler("".join(x for x, _ in turns), [angle for _, angle in turns])
     # rotations below 1e-10 are dropped
     assert np.allclose(again, rotation, atol=3e-10, rtol=0)
 
 
 def test_decomposition_uses_the_fewest_rotations() -> None:
     quarter = math.pi / 2
-    assert rotations.axis_rotations(rotations.from_rpy(quarter, 0, 0)) == (("x", quarter),)
-    assert rotations.axis_rotations(rotations.from_rpy(0, math.pi, 0)) == (("y", math.pi),)
-    assert rotations.axis_rotations(rotations.from_rpy(math.pi, 0.3, math.pi)) == (
+    assert geometry.axis_rotations(geometry.from_rpy(quarter, 0, 0)) == (("x", quarter),)
+    assert geometry.axis_rotations(geometry.from_rpy(0, math.pi, 0)) == (("y", math.pi),)
+    assert geometry.axis_rotations(geometry.from_rpy(math.pi, 0.3, math.pi)) == (
         ("y", pytest.approx(math.pi - 0.3)),
     )
-    assert rotations.axis_rotations(rotations.IDENTITY) == ()
+    assert geometry.axis_rotations(geometry.IDENTITY) == ()
 
 
 @given(angles, angles, angles)
 def test_quaternions_and_euler_angles_agree(a: float, b: float, c: float) -> None:
     w, x = math.cos(a / 2), math.sin(a / 2)
     assert np.allclose(
-        rotations.from_quaternion(2 * w, 2 * x, 0, 0), rotation_matrix("x", a), atol=4e-12
+        geometry.from_quaternion(2 * w, 2 * x, 0, 0), rotation_matrix("x", a), atol=4e-12
     )
     small = rotation_matrix("x", a) @ rotation_matrix("y", b) @ rotation_matrix("z", c)
-    assert np.allclose(rotations.from_euler("xyz", (a, b, c)), small, atol=4e-12)
+    assert np.allclose(geometry.from_euler("xyz", (a, b, c)), small, atol=4e-12)
     capitals = rotation_matrix("z", c) @ rotation_matrix("y", b) @ rotation_matrix("x", a)
-    assert np.allclose(rotations.from_euler("XYZ", (a, b, c)), capitals, atol=4e-12)
+    assert np.allclose(geometry.from_euler("XYZ", (a, b, c)), capitals, atol=4e-12)
 
 
 def test_quarter_turn_has_exact_zeros() -> None:
-    assert np.array_equal(rotations.from_rpy(math.pi / 2, 0, 0), R_X)
+    assert np.array_equal(geometry.from_rpy(math.pi / 2, 0, 0), R_X)
 
 
 def test_rotated_tensor_gives_the_same_energy() -> None:
     inertia = (1.0, 2.0, 2.5, 0.1, -0.2, 0.3)
-    rotation = rotations.from_rpy(0.3, -0.4, 1.1)
+    rotation = geometry.from_rpy(0.3, -0.4, 1.1)
     old = np.array([[1.0, 0.1, -0.2], [0.1, 2.0, 0.3], [-0.2, 0.3, 2.5]])
     expected = np.array(rotation) @ old @ np.array(rotation).T
-    xx, yy, zz, xy, xz, yz = inertias.rotated_inertia(inertia, rotation)
+    xx, yy, zz, xy, xz, yz = geometry.rotated_inertia(inertia, rotation)
     # some rounding errors
     assert np.allclose([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], expected, rtol=0, atol=1e-15)
 
 
 def test_invalid_tensors_are_reported_with_a_valid_one() -> None:
-    assert not inertias.triangle_message((1.0, 1.0, 2.0, 0, 0, 0))
-    assert not inertias.indefinite_message((0.0, 0.0, 0.0, 0, 0, 0))
-    reported = inertias.triangle_message((1.0, 1.0, 2.1, 0, 0, 0))
+    assert not geometry.triangle_message((1.0, 1.0, 2.0, 0, 0, 0))
+    assert not geometry.indefinite_message((0.0, 0.0, 0.0, 0, 0, 0))
+    reported = geometry.triangle_message((1.0, 1.0, 2.1, 0, 0, 0))
     assert (
         "1, 1, 2.1 break the triangle inequality" in reported
         and "[1.0333333, 1.0333333, 2.0666667, 0, 0, 0] would do" in reported
     )
-    assert "-1" in inertias.indefinite_message((1.0, 1.0, -1.0, 0, 0, 0))
+    assert "-1" in geometry.indefinite_message((1.0, 1.0, -1.0, 0, 0, 0))
 
 
 @pytest.mark.parametrize(
@@ -110,8 +110,8 @@ def test_invalid_tensors_are_reported_with_a_valid_one() -> None:
      (1e-8, 2e-8, 4e-8, 6e-8, 1e-8, 1e-8), (-1.0, -2.0, -0.5, 0.1, 0, 0)],
 )  # fmt: skip
 def test_nearest_valid_tensor_is_valid_and_nearest(inertia: Inertia) -> None:
-    near = inertias.nearest_valid(inertia)
-    assert not inertias.indefinite_message(near) and not inertias.triangle_message(near)
+    near = geometry.nearest_valid(inertia)
+    assert not geometry.indefinite_message(near) and not geometry.triangle_message(near)
 
     def distance(other: Inertia) -> float:
         """Return the Frobenius distance, over all nine entries."""
@@ -129,7 +129,7 @@ def test_nearest_valid_tensor_is_valid_and_nearest(inertia: Inertia) -> None:
         other = tuple(part * bodys + (1 - part) * np.array(near))
         assert distance(near) <= distance(other) + 1e-12 * distance((0, 0, 0, 0, 0, 0))
     good = (1.0, 1.1, 1.2, 0.1, 0, 0)
-    assert inertias.nearest_valid(good) == pytest.approx(good, rel=1e-14)
+    assert geometry.nearest_valid(good) == pytest.approx(good, rel=1e-14)
 
 
 @pytest.mark.parametrize(
@@ -147,7 +147,7 @@ def test_no_replacement_is_proposed_for_tensors_with_wrong_signs(tensor: Inertia
     robot = replace(arm(), bodies=(base, replace(body, inertia=tensor), *rest))
     assert edit.with_nearest_inertias(robot) == robot
     with pytest.raises(EomcError) as fault:
-        preparation.prepare_for_scene(robot)
+        scene_text.prepare_for_scene(robot)
     assert "check the signs of the tensor" in str(fault.value)
     assert "would do" not in str(fault.value) and "--mend-inertias" not in str(fault.value)
 
@@ -181,7 +181,7 @@ def arm() -> Robot:
             RobotBody("column", "base", "revolute", (JointMotion("pan", "rad", start=0.5),),
                       ((0.0, 0.0, 1.0),), (0.0, 0.0, 0.4), mass=2.0, inertia=inertia),
             RobotBody("boom", "column", "revolute", (JointMotion("lift", "rad", damping=0.1),),
-                      ((0.0, 1.0, 0.0),), (0.1, 0.0, 0.0), rotations.from_rpy(0, 0, math.pi / 2),
+                      ((0.0, 1.0, 0.0),), (0.1, 0.0, 0.0), geometry.from_rpy(0, 0, math.pi / 2),
                       mass=1.0, center=(0.5, 0.0, 0.0), inertia=inertia),
             RobotBody("lamp", "column", mass=0.1),
             RobotBody("trolley", "boom", "prismatic", (JointMotion("reach", "m", note="0 to 1"),),
@@ -226,7 +226,7 @@ def test_locked_joint_keeps_its_value(name: str) -> None:
     ):
         assert np.allclose(ours, theirs, atol=1e-15)
     assert name not in [drive.coordinate for drive in locked.drives]
-    assert f"joint {name} locked at {q[name]}" in scene_text.scene_text(locked)
+    assert f"joint {name} stands at {q[name]}" in scene_text.scene_text(locked)
 
 
 def test_invalid_locks_are_refused() -> None:
@@ -265,7 +265,7 @@ def test_base_is_freed_and_fixed_again() -> None:
     assert [m.name for m in free.motions][:6] == ["x", "y", "z", "yaw", "pitch", "roll"]
     assert edit.with_base(free, free=False) == arm()
     root = replace(
-        arm().bodies[0], offset=(1.0, 2.0, 3.0), rotation=rotations.from_rpy(0.1, 0.2, 0.3)
+        arm().bodies[0], offset=(1.0, 2.0, 3.0), rotation=geometry.from_rpy(0.1, 0.2, 0.3)
     )
     stood = replace(arm(), bodies=(root, *arm().bodies[1:]))
     free = edit.with_base(stood, free=True)
@@ -315,9 +315,9 @@ def test_numbers_survive_writing_and_reading(x: float) -> None:
 
 @given(angles)
 def test_angles_survive_writing_and_reading_within_rounding(x: float) -> None:
-    text = scene_text.angle(x)
-    value = eval(text.strip('"'), {"pi": math.pi})
-    assert abs(value - x) <= (1e-10 if text.startswith('"') or text == "0" else 4e-16)
+    angle = scene_text.angle(x)
+    value = eval(str(angle), {"pi": math.pi})
+    assert abs(value - x) <= (1e-10 if isinstance(angle, str) or angle == 0 else 4e-16)
 
 
 def test_names_become_valid_in_a_scene() -> None:
@@ -330,7 +330,7 @@ def test_names_become_valid_in_a_scene() -> None:
         replace(body, name="y", parent="x" * 60, motions=(JointMotion("y_x", "rad"),)),
     )
     drives = (Drive("a.b", "a.b"), Drive("a_b", "while"))
-    robot = preparation.prepare_for_scene(replace(arm(), name="math", bodies=bodies, drives=drives))
+    robot = scene_text.prepare_for_scene(replace(arm(), name="math", bodies=bodies, drives=drives))
     coordinates = [m.name for m in robot.motions]
     taken = [*coordinates, *(f"{c}_dot" for c in coordinates), *(d.name for d in robot.drives)]
     taken += [f"{b.name}_{letter}" for b in robot.bodies for letter in "xyz"]
@@ -339,7 +339,7 @@ def test_names_become_valid_in_a_scene() -> None:
     assert names.module_fault(robot.name) is None
     assert "'a.b' in the file" in robot.motions[0].note
     assert [d.coordinate for d in robot.drives] == [coordinates[0], coordinates[2]]
-    assert preparation.prepare_for_scene(robot) == robot
+    assert scene_text.prepare_for_scene(robot) == robot
 
 
 def test_foreign_texts_are_escaped() -> None:
@@ -356,15 +356,15 @@ def test_joints_without_mass_are_refused_with_the_remedy() -> None:
     )  # fmt: skip
     bodies = (*arm().bodies[:6], finger)
     with pytest.raises(EomcError) as fault:
-        preparation.prepare_for_scene(replace(arm(), bodies=bodies))
+        scene_text.prepare_for_scene(replace(arm(), bodies=bodies))
     assert "joint f-1: it moves nothing that has inertia, only finger (a mesh only)" in str(
         fault.value
     )
     assert "--lock f-1=0" in str(fault.value)
     locked = edit.lock(replace(arm(), bodies=bodies), {"f-1": 0.0})
-    assert len(preparation.prepare_for_scene(locked).motions) == 3
+    assert len(scene_text.prepare_for_scene(locked).motions) == 3
     with pytest.raises(EomcError, match="nothing moves"):
-        preparation.prepare_for_scene(replace(arm(), bodies=arm().bodies[:1]))
+        scene_text.prepare_for_scene(replace(arm(), bodies=arm().bodies[:1]))
 
 
 def test_invalid_inertias_are_refused() -> None:
@@ -372,8 +372,8 @@ def test_invalid_inertias_are_refused() -> None:
     robot = replace(arm(), bodies=(RobotBody("base"), broken), drives=())
     assert any(
         "body column: its principal moments" in w
-        for w in preparation.prepare_for_scene(robot).left_out
+        for w in scene_text.prepare_for_scene(robot).left_out
     )
     negative = replace(broken, inertia=(0.1, 0.1, -0.1, 0.0, 0.0, 0.0))
     with pytest.raises(EomcError, match="body column: its smallest principal moment"):
-        preparation.prepare_for_scene(replace(robot, bodies=(RobotBody("base"), negative)))
+        scene_text.prepare_for_scene(replace(robot, bodies=(RobotBody("base"), negative)))

@@ -23,15 +23,14 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from conftest import Modules
 from numpy.typing import NDArray
+from support.session import Modules
 
 from eomc.derive.lagrange import derive
-from eomc.model.from_scene import from_scene
+from eomc.model.system import from_scene
 from eomc.program import program
-from eomc.program.interpret import evaluate
-from eomc.robots import edit, scene_text, urdf
-from eomc.robots.mjcf import read
+from eomc.program.ir import evaluate
+from eomc.robots import edit, mjcf, scene_text, urdf
 from eomc.robots.robot import Robot
 from eomc.scene.read import parse
 
@@ -136,7 +135,7 @@ def from_urdf(
 
 def from_mjcf(name: str) -> Pair:
     file = gymnasium_model(name)
-    return pair(read.read(file), mujoco.MjModel.from_xml_path(str(file)))
+    return pair(mjcf.read(file), mujoco.MjModel.from_xml_path(str(file)))
 
 
 def disable_other_forces(model: Any) -> Any:

@@ -7,11 +7,10 @@ from pathlib import Path
 from xml.etree.ElementTree import Element, fromstring, tostring
 
 import pytest
-from mjcf_text import model
+from support.mjcf import model
 
 from eomc.base.errors import SceneError
-from eomc.robots import urdf, xml
-from eomc.robots.mjcf import read
+from eomc.robots import mjcf, urdf, xml
 from eomc.robots.mjcf.file import ACTUATORS, SCHEMA
 
 BEFORE = """<compiler angel="radian"><x/></compiler>
@@ -199,7 +198,7 @@ def read_tree(file: Path, root: Element) -> object:
     """Return the robot of a tree, or its faults."""
     file.write_bytes(tostring(root))
     try:
-        return read.read(file)
+        return mjcf.read(file)
     except SceneError as fault:
         return str(fault)
 

@@ -6,21 +6,19 @@ import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 
-import mjcf_text
 import numpy as np
 import pytest
-from mjcf_text import BODY, model, refused, reported
+from support import mjcf
+from support.mjcf import BODY, model, refused, reported
 
 import eomc
 from eomc.derive.lagrange import derive
-from eomc.model.from_scene import from_scene
+from eomc.model.system import from_scene
 from eomc.program import program
-from eomc.program.interpret import evaluate
-from eomc.robots.edit import cut, lock
-from eomc.robots.limits import joint_stops
-from eomc.robots.preparation import prepare_for_scene
+from eomc.program.ir import evaluate
+from eomc.robots.edit import cut, joint_stops, lock
 from eomc.robots.robot import Law, Robot
-from eomc.robots.scene_text import scene_text
+from eomc.robots.scene_text import prepare_for_scene, scene_text
 from eomc.scene.read import parse
 
 GENERAL = '<general gainprm="3 1 2" biasprm="1 2 -5"/>'
@@ -260,7 +258,7 @@ def test_effort_of_stops_includes_servos_and_tendons(tmp_path: Path) -> None:
 
 def test_without_drives_no_tendon_is_reported_as_idle(tmp_path: Path) -> None:
     text = f"<mujoco>{BEFORE}<worldbody>{ARM}</worldbody>{AFTER}</mujoco>"
-    _, scene = mjcf_text.import_robot(tmp_path, text, "--no-drives")
+    _, scene = mjcf.import_robot(tmp_path, text, "--no-drives")
     assert list(tomllib.loads(scene)["definitions"]) == ["sum", "a_2"]
 
 
@@ -270,7 +268,7 @@ def test_without_drives_no_tendon_is_reported_as_idle(tmp_path: Path) -> None:
         ('<actuator><position joint="j" kp="x"/></actuator>', 'kp="x"'),
         ('<actuator><motor tendon="t"/></actuator>', 'there is no tendon "t"'),
         ('<tendon><fixed name="t"><joint joint="k"/></fixed></tendon>', 'there is no joint "k"'),
-        ('<tendon><fixed name="t"><joint/></fixed></tendon>', "it needs a joint"),
+        ('<tendon><fixed name="t"><joint/></fixed></tendon>', "it needs joint"),
         ('<tendon><fixed name="t" damping="-1"><joint joint="j"/></fixed></tendon>', "negative"),
     ],
 )
@@ -287,7 +285,7 @@ def test_motion_of_arms_agrees_with_mujoco(
     """Compare accelerations at random states, and a run from the key frame with its controls."""
     mujoco = pytest.importorskip("mujoco", minversion="4")
     text = f"<mujoco>{BEFORE}<worldbody>{ARM}</worldbody>{AFTER}</mujoco>".replace(ROPE, "")
-    mjcf_text.import_robot(tmp_path, text, *words)
+    mjcf.import_robot(tmp_path, text, *words)
     m = eomc.load(tmp_path / "robot.toml", tmp_path)
     theirs = mujoco.MjModel.from_xml_string(text)
     off = mujoco.mjtDisableBit

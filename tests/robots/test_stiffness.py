@@ -8,16 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import Modules
-from mjcf_text import model
+from support.mjcf import model
+from support.session import Modules
 
 from eomc.derive.lagrange import derive
-from eomc.model.from_scene import from_scene
+from eomc.model.system import from_scene
 from eomc.program import program
 from eomc.robots import edit, stiffness, urdf
-from eomc.robots.preparation import prepare_for_scene
 from eomc.robots.robot import Robot
-from eomc.robots.scene_text import scene_text
+from eomc.robots.scene_text import prepare_for_scene, scene_text
 from eomc.scene.read import parse
 
 WRIST = """<robot name="wrist">

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import tiers
-from mjcf_text import import_robot
+from support.mjcf import import_robot
+from support.session import tiers
 
 import eomc
 

@@ -16,8 +16,8 @@ import eomc
 from eomc.base.errors import EomcError
 from eomc.cli.main import main
 from eomc.model import kinematics
-from eomc.model.from_scene import from_scene
-from eomc.robots import edit, preparation, rotations, scene_text, urdf
+from eomc.model.system import from_scene
+from eomc.robots import edit, geometry, scene_text, urdf
 from eomc.robots.robot import Robot, body_pose
 from eomc.scene import read as scene
 from eomc.scene.read import parse
@@ -80,7 +80,7 @@ def test_arm_is_read(read: Reader) -> None:
     base, arm, slide, tool = robot.bodies
     assert (base.joint, base.parent, tool.joint) == ("fixed", "world", "fixed")
     assert arm.joint == "revolute" and arm.axes == ((0, 0.6, 0.8),) and arm.offset == (0, 0, 0.5)
-    assert arm.rotation == rotations.from_rpy(0.1, 0.2, 0.3)
+    assert arm.rotation == geometry.from_rpy(0.1, 0.2, 0.3)
     assert (arm.mass, arm.center) == (2, (0.1, 0.2, 0.3))
     # Rotated by a quarter turn about z: x' = y, y' = -x.
     assert np.allclose(arm.inertia, (0.2, 0.1, 0.25, -0.01, -0.03, 0.02), rtol=0, atol=1e-16)
@@ -100,7 +100,7 @@ def test_arm_is_read(read: Reader) -> None:
 
 
 def test_ignored_elements_are_reported(read: Reader) -> None:
-    reported = "\n".join(preparation.prepare_for_scene(read(ARM)).left_out)
+    reported = "\n".join(scene_text.prepare_for_scene(read(ARM)).left_out)
     for words in (
         "1 mesh (not opened)", "1 box",
         "limits of 2 joints", "<safety_controller>", "<transmission>", "<gazebo>", "<material>",
@@ -109,7 +109,7 @@ def test_ignored_elements_are_reported(read: Reader) -> None:
 
 
 def test_frames_without_mass_are_points(read: Reader) -> None:
-    robot = preparation.prepare_for_scene(read(ARM))
+    robot = scene_text.prepare_for_scene(read(ARM))
     (tool,) = [body for body in robot.bodies if body.point]
     text = scene_text.scene_text(read(ARM))
     assert text.endswith(f'[[point]]\nname = "{tool.name}"\nbody = "{tool.parent}"\n')
@@ -163,14 +163,14 @@ def test_planar_joint_moves_perpendicular_to_its_axis(read: Reader, axis: str) -
             offset, rotation = body_pose(body, q if body.motions else ())
             at, turned = np.array(offset) + np.array(rotation) @ at, np.array(rotation) @ turned
             name = body.parent
-        joint = np.array(rotations.from_rpy(0.1, 0.2, 0.3))
+        joint = np.array(geometry.from_rpy(0.1, 0.2, 0.3))
         return joint.T @ (at - [0, 0, 0.5]), joint.T @ turned
 
     at, turned = place((0, 0, 0))
     assert np.allclose(at, 0, atol=1e-15) and np.allclose(turned, np.eye(3), atol=1e-11)
     at, turned = place((0.3, -0.4, 0.7))
     assert abs(at @ normal) < 1e-11 and np.isclose(np.linalg.norm(at), 0.5, rtol=1e-11)
-    assert np.allclose(turned, rotations.from_axis_angle(tuple(normal), 0.7), atol=1e-11)  # type: ignore[arg-type]
+    assert np.allclose(turned, geometry.from_axis_angle(tuple(normal), 0.7), atol=1e-11)  # type: ignore[arg-type]
 
 
 def test_root_named_world_is_the_world(read: Reader) -> None:
@@ -204,9 +204,9 @@ def joint(name: str, parent: str, child: str, rest: str = "") -> str:
         ('<mass value="2"/>', '<mass value="nan"/>', "'nan' is not a finite number"),
         ('<mass value="2"/>', '<mass value="1e300"/>', "'1e300' is more than 1e+100"),
         ('<mass value="2"/>', '<mass value="${m}"/>', "run xacro first"),
-        ('<mass value="2"/>', '<mass value="2 kg"/>', "'2 kg' is not a number"),
+        ('<mass value="2"/>', '<mass value="2 kg"/>', "of <mass>: 'kg' is not a number"),
         ('izz="0.25"', "", "link upper-arm: <inertia> has no izz"),
-        ('xyz="0 0 0.5"', 'xyz="0 0.5"', 'xyz="0 0.5" of <origin> is not three numbers'),
+        ('xyz="0 0 0.5"', 'xyz="0 0.5"', 'xyz="0 0.5" of <origin> has 2 numbers; it takes 3'),
         ('damping="0.4"', 'damping="-0.4"', "joint shoulder: its damping is negative"),
         ('name="slide"', 'name="base"', "link base: a second link has this name"),
         ('name="extend"', "", "joint 2: it has no name"),
@@ -216,7 +216,7 @@ def joint(name: str, parent: str, child: str, rest: str = "") -> str:
          "link upper-arm: it has 2 <mass>: leave the one that is meant"),
         ('<parent link="base"/>', '<parent link="base"/><parent link="slide"/>',
          "joint shoulder: it has 2 <parent>"),
-        ('xyz="0 0 0.5"', 'xyz="$(arg x) 0 0"', "is not three numbers; it holds xacro macros"),
+        ('xyz="0 0 0.5"', 'xyz="$(arg x) 0 0"', "it holds xacro macros"),
     ],
 )  # fmt: skip
 def test_faults_name_the_link_or_joint_and_the_remedy(
@@ -291,12 +291,12 @@ def test_free_root_without_inertia_is_reported(read: Reader) -> None:
     root = robot.bodies[0]
     light = replace(root, mass=0.0, inertia=(0.0,) * 6)
     robot_of_light = replace(robot, bodies=(light, *robot.bodies[1:]))
-    line = preparation.prepare_for_scene(robot_of_light).left_out[-1]
+    line = scene_text.prepare_for_scene(robot_of_light).left_out[-1]
     assert line.startswith(f"body {root.name}: it is free and has neither mass nor inertia")
     assert "--base fixed" in line
     heavy = replace(root, mass=1.0)
     for bodies in ((heavy, *robot.bodies[1:]), read(ARM).bodies):
-        lines = preparation.prepare_for_scene(replace(robot, bodies=bodies)).left_out
+        lines = scene_text.prepare_for_scene(replace(robot, bodies=bodies)).left_out
         assert not any("free" in words for words in lines)
     with pytest.raises(EomcError, match=r"body\.base: D is not .* 'base' has no inertia"):
         eomc.sources(from_scene(parse(scene_text.scene_text(robot_of_light), "crane.toml")))
@@ -308,7 +308,7 @@ def test_mesh_is_refused_only_where_a_joint_needs_inertia(read: Reader) -> None:
         '<link name="slide"><visual><geometry><mesh filename="s.stl"/></geometry></visual></link>',
     )
     with pytest.raises(EomcError) as fault:
-        preparation.prepare_for_scene(read(text))
+        scene_text.prepare_for_scene(read(text))
     assert "joint extend: it moves nothing that has mass" in str(fault.value)
     assert "slide (a mesh only, no <inertial>)" in str(fault.value)
     assert "--lock extend=0" in str(fault.value)

@@ -9,7 +9,7 @@ from types import ModuleType
 import pytest
 
 import eomc
-from eomc.model.from_scene import from_scene
+from eomc.model.system import from_scene
 from eomc.scene.read import parse
 
 pytestmark = pytest.mark.usefixtures("unoptimised_file")

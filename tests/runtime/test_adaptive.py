@@ -8,15 +8,15 @@ import warnings
 from pathlib import Path
 from types import ModuleType
 
-import cases
 import numpy as np
 import pytest
-from conftest import Modules, tiers
+from support import cases
+from support.session import Modules, tiers
 
 import eomc
 from eomc.base.errors import SceneError
-from eomc.model.from_scene import from_scene
-from eomc.model.system import System
+from eomc.model.system import System, from_scene
+from eomc.runtime.package import model_of
 from eomc.runtime.status import STATUS
 from eomc.scene.read import parse
 from eomc.verify.check import check
@@ -103,10 +103,10 @@ def test_run_split_into_several_calls_is_identical(
     kepler: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = kepler.simulate(duration=50.0)
-    module = __import__(f"{kepler.__name__}._runtime.adaptive", fromlist=["adaptive"])
-    monkeypatch.setattr(module, "_FIRST_CALL_STEPS", 1)
-    monkeypatch.setattr(module, "_MAX_STEPS_PER_CALL", 3)
-    monkeypatch.setattr(kepler._model.integrator, "room", 0)
+    module = __import__(f"{kepler.__name__}._runtime.integration", fromlist=["integration"])
+    monkeypatch.setattr(module, "FIRST_CALL_STEPS", 1)
+    monkeypatch.setattr(module, "MAX_STEPS_PER_CALL", 3)
+    monkeypatch.setattr(model_of(kepler).integrator, "room", 0)
     repeated = kepler.simulate(duration=50.0)
     assert repeated == run and np.array_equal(repeated.t, run.t) and repeated.steps == run.steps
     assert pickle.loads(pickle.dumps(run)) == run
@@ -128,7 +128,7 @@ def test_run_in_one_call_equals_run_with_progress(kepler: ModuleType, options: d
     """Compare the fast path of repeated short runs with the general path."""
     kepler.simulate(duration=PERIOD)  # stores the number of steps
     fast = kepler.simulate(duration=PERIOD, tol=1e-8, **options)
-    assert 0 < fast.steps + 1 <= kepler._model.integrator.room
+    assert 0 < fast.steps + 1 <= model_of(kepler).integrator.room
     general = kepler.simulate(
         duration=PERIOD, tol=1e-8, **options, progress=lambda finished, total: None
     )
@@ -170,7 +170,7 @@ def test_distant_end_time_changes_no_step(kepler: ModuleType, end: float) -> Non
 
 def test_run_with_more_steps_than_previous_run_is_complete(kepler: ModuleType) -> None:
     kepler.simulate(duration=0.1)
-    n_rows = kepler._model.integrator.room
+    n_rows = model_of(kepler).integrator.room
     run = kepler.simulate(duration=20 * PERIOD)
     assert run.steps > n_rows and run.t[-1] == 20 * PERIOD
     assert run == kepler.simulate(duration=20 * PERIOD)
@@ -180,13 +180,18 @@ def test_run_in_one_call_is_unaffected_by_other_threads(
     kepler: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Another thread whose run stops now shrinks the buffer of later runs, not of this one."""
-    run, model = kepler.simulate(q0=[0.2, 0.0], duration=1.0), kepler._model
+    run, model = kepler.simulate(q0=[0.2, 0.0], duration=1.0), model_of(kepler)
 
-    def shrink_buffer(x0: object, name: str) -> object:
-        model.integrator.room = 0
-        return type(model.arguments).initial_half(model.arguments, x0, name)
+    class Library:
+        """The functions of C; while one runs, the other thread's run stops."""
 
-    monkeypatch.setattr(model.arguments, "initial_half", shrink_buffer, raising=False)
+        lib = model.c.lib
+
+        def __getattr__(self, name: str) -> object:
+            model.integrator.room = 0
+            return getattr(self.lib, name)
+
+    monkeypatch.setattr(model.c, "lib", Library())
     assert model.integrator.room and kepler.simulate(q0=[0.2, 0.0], duration=1.0) == run
     assert model.integrator.room == 0  # the general path would have set it again
 
@@ -210,7 +215,7 @@ def test_run_ends_at_time_rounded_to_single_precision(single: ModuleType) -> Non
     """0.7 s is later than the nearest float, 0.3 s is earlier."""
     for n_rows in (0, 48):
         for t0, duration in ((0.0, 0.7), (0.0, 0.3), (0.7, 0.0), (0.1, 0.6)):
-            single._model.integrator.room = n_rows
+            model_of(single).integrator.room = n_rows
             run = single.simulate(duration=duration, t0=t0)
             assert run.status == "ok" and run.t[-1] == np.float32(t0 + duration)
 
@@ -286,20 +291,21 @@ def test_error_is_estimated_at_the_smallest_tolerance(kepler: ModuleType) -> Non
     assert true_error / 10 < max(run.estimate().end.values()) < 100 * true_error + 1e-13
 
 
-def test_perturbed_start_near_a_centre_takes_few_steps(kepler: ModuleType) -> None:
+def test_perturbed_start_near_a_centre_takes_few_steps(
+    kepler: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Regression: a perturbation beyond the centre led to an orbit of 1e7 revolutions."""
-    error_module = __import__(
-        f"{kepler.__name__}._runtime.adaptive_error", fromlist=["adaptive_error"]
-    )
     q0, speed = 1e-6, math.sqrt((2 - 1e-6) / 1e-6)
     original, steps = kepler.simulate([q0, 0], [0, speed], duration=6.0, tol=1e-10), []
 
+    integrate = model_of(kepler).integrator.integrate
+
     def record(*arguments: object) -> object:
-        steps.append(run(*arguments))
+        steps.append(integrate(*arguments))
         return steps[-1]
 
-    run = __import__(f"{kepler.__name__}._runtime.adaptive", fromlist=["adaptive"]).run
-    error_module.error_by_tighter_tolerance(original, record, None)
+    monkeypatch.setattr(model_of(kepler).integrator, "integrate", record)
+    original.estimate()
     assert max(run.steps for run in steps) < 1_000_000
 
 
@@ -375,22 +381,23 @@ def test_invalid_arguments_of_adaptive_runs_are_refused(
 
 
 def test_start_time_that_is_not_finite_is_refused(kepler: ModuleType) -> None:
-    model = kepler._model
-    null = model.c.tools[2]
+    model = model_of(kepler)
+    null, p, x = model.c.null, model.c.pointer(model.info.p0), np.array([0.1, 0, 0, 4.0])
+    state = model.c.pointer(x[:2]), model.c.pointer(x[2:])
     for start in (math.nan, math.inf):
-        work, x = model.c.ffi.new("adaptive_work *"), np.array([0.1, 0, 0, 4.0])
-        t = np.array([start])
-        status = model.c.lib.adaptive(
-            model.c.pointer(x), model.c.pointer(t), 1.0, 1e-9, 0.0, null, 10, null, 0, null, null,
-            null, model.c.pointer(model.info.p0), work,
-        )  # fmt: skip
-        assert (status, work.rows, work.steps) == (STATUS.index("not finite"), 0, 0)
-        assert x.tolist() == [0.1, 0, 0, 4.0]
+        options = model.c.ffi.new("run_options *", {"t0": start, "t_end": 1.0, "tol": 1e-9})
+        options.steps, work = 10, model.c.ffi.new("run_work *")
+        output = model.c.ffi.addressof(work, "output")
+        status = model.c.lib.integrate(
+            options, output, work, *state, null, 0, null, 0, p, null, null, null
+        )
+        assert (status, output.rows, output.steps) == (STATUS.index("not finite"), 0, 0)
+        assert list(work.x) == x.tolist()
 
 
 def test_method_auto_selects_adaptive_steps(kepler: ModuleType, cartpole: ModuleType) -> None:
     run, default = kepler.simulate(method="auto", duration=1.0), kepler.simulate(duration=1.0)
-    assert run.tol == kepler._model.info.tolerance and np.array_equal(run.q, default.q)
+    assert run.tol == model_of(kepler).info.tolerance and np.array_equal(run.q, default.q)
     assert kepler.simulate(method="auto", tol=1e-6, duration=1.0).steps < run.steps
     with pytest.raises(ValueError, match="built without adaptive steps"):
         cartpole.simulate(method="auto")
@@ -408,7 +415,7 @@ def test_tolerance_is_refused_where_scene_has_none(cartpole: ModuleType) -> None
         match=r"tol: cartpole was built without adaptive steps.* \[run\] tolerance = 1e-9",
     ):
         cartpole.simulate(tol=1e-9)
-    assert not hasattr(cartpole._model.c.lib, "adaptive")
+    assert not hasattr(model_of(cartpole).c.lib, "adaptive")
 
 
 @pytest.mark.parametrize("value", ["0", "1", "1e-16", '"1e-9"', "true"])
@@ -443,7 +450,7 @@ def test_check_compares_both_c_forms_with_the_reference(scene: str, real: str) -
         plain = eomc.load(system, BUILDS, form="plain")
         report = check(system, eomc.load(system, BUILDS), plain=plain, states=4)
     rows = [row for row in report.results if "adaptive" in row.name]
-    assert len(rows) == 8 and all(row.passed for row in rows), rows
+    assert len(rows) == 3 and all(row.passed for row in rows), rows  # each of both forms
 
 
 def test_portable_form_has_adaptive_and_fixed_steps(tmp_path: Path) -> None:

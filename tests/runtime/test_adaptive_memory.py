@@ -7,7 +7,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from conftest import Modules
+from support.session import Modules
 
 # jumps follow ever faster: the n-th comes 0.1/(1 + n^2) s after the one before
 ENDLESS = """eomc = 1
@@ -45,7 +45,7 @@ def endless(modules: Modules) -> ModuleType:
 @pytest.fixture(autouse=True)
 def limit_memory(endless: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pretend that the machine has 5 MB."""
-    memory = sys.modules[f"{endless.__name__}._runtime.adaptive"]
+    memory = sys.modules[f"{endless.__name__}._runtime.integration"]
     monkeypatch.setattr(memory, "machine_memory", lambda: MEMORY)
 
 
@@ -75,5 +75,5 @@ def test_run_that_fits_into_memory_completes(endless: ModuleType) -> None:
 
 
 def test_more_output_times_than_memory_are_refused(endless: ModuleType) -> None:
-    with pytest.raises(MemoryError, match=r"200000 rows of 5 numbers don't fit.*fewer times="):
+    with pytest.raises(MemoryError, match=r"200001 rows of 5 numbers don't fit.*fewer times="):
         endless.simulate(times=np.linspace(0.0, 0.1, 200_001))

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Modules
+from support.session import Modules
 
 SCENE = """eomc = 1
 name = "sampled"

@@ -7,14 +7,14 @@ from functools import cache
 from pathlib import Path
 from types import ModuleType
 
-import cases
 import mpmath
 import numpy as np
 import pytest
-from conftest import Modules, tiers
+from support import cases
+from support.session import Modules, tiers
 
 import eomc
-from eomc.model.from_scene import from_scene
+from eomc.model.system import from_scene
 from eomc.scene.read import parse
 
 pytestmark = pytest.mark.usefixtures("unoptimised_file")

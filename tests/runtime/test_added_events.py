@@ -15,6 +15,7 @@ from sympy.physics.mechanics import dynamicsymbols
 import eomc
 from eomc import pipeline
 from eomc.base.errors import EomcError
+from eomc.runtime.package import model_of
 
 pytestmark = pytest.mark.usefixtures("unoptimised_file")
 TOL = 1e-9  # default tolerance of a scene with events
@@ -46,19 +47,21 @@ name = "turns"
 when = "x_dot"
 direction = "rising"
 [run]
+tolerance = 1e-9
 duration = 10
 batch = true
 """
 
 
-@pytest.fixture(scope="module")
+# Once a process: a scene that is loaded from another folder is the same module.
+@pytest.fixture(scope="session")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("asked") / "oscillator.toml"
     file.write_text(TEXT)
     return file
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def oscillator(scene: Path) -> ModuleType:
     return eomc.load(scene, scene.parent / "build")
 
@@ -120,7 +123,7 @@ def test_added_events_are_compiled_once(oscillator: ModuleType, scene: Path) -> 
 
     oscillator.simulate(duration=1.0, events=EVENTS)
     first = modification_times()
-    oscillator._model.extensions.clear()  # simulates a new process
+    model_of(oscillator).extensions.clear()  # simulates a new process
     run = oscillator.simulate(duration=1.0, events=EVENTS)
     assert len(run.events["through"]) == 1 and modification_times() == first != {}
     assert pickle.loads(pickle.dumps(run)).events["through"].t == run.events["through"].t
@@ -144,7 +147,7 @@ def test_saved_run_with_events_is_loaded(oscillator: ModuleType, tmp_path: Path)
             np.testing.assert_array_equal(loaded.events["drop"].t, run.events["drop"].t)
             if not k:
                 assert np.array_equal(loaded(times), run(times)) and loaded(2.0)[0][2] == 4
-        oscillator._model.extensions.clear()
+        model_of(oscillator).extensions.clear()
 
 
 def test_saved_run_without_its_scene_is_refused_with_advice(
@@ -152,8 +155,8 @@ def test_saved_run_without_its_scene_is_refused_with_advice(
 ) -> None:
     file = tmp_path / "run.npz"
     oscillator.simulate(duration=1.0, events=EVENTS).save(file)
-    oscillator._model.extensions.clear()
-    monkeypatch.setattr(oscillator._model, "source", None)
+    model_of(oscillator).extensions.clear()
+    monkeypatch.setattr(model_of(oscillator), "source", None)
     with pytest.raises(EomcError, match=r"load it with eomc\.load") as error:
         oscillator.load_run(file)
     assert "numpy.load reads its rows" in error.value.__notes__[0]
@@ -188,7 +191,7 @@ def test_missing_or_changed_scene_is_reported(
         (other, "has changed since it was built: load it again"),
         (None, r"load it with eomc\.load"),
     ):
-        monkeypatch.setattr(oscillator._model, "source", source)
+        monkeypatch.setattr(model_of(oscillator), "source", source)
         with pytest.raises(EomcError, match=message):
             oscillator.simulate(events={"a": "x"})
 
@@ -210,7 +213,7 @@ def pendulum() -> eomc.System:
     return eomc.System.make(
         "swinging", {theta: 0.5}, theta.diff() ** 2 / 2, w**2 * theta**2 / 2,
         parameters={w: 2.0, d: 0.0, low: -9.0, brake: 9.0}, forces={theta: -d * theta.diff()},
-        batch=True,
+        batch=True, tolerance=1e-9,
         events={"turns": {"when": theta.diff(), "direction": "rising"}},
     )  # fmt: skip
 
@@ -253,7 +256,7 @@ def test_saved_run_of_a_system_needs_the_events_again(systems: Path, tmp_path: P
     run.save(file)
     loaded = m.load_run(file)
     assert loaded == run and loaded.events["half"].t == run.events["half"].t
-    m._model.extensions.clear()
+    model_of(m).extensions.clear()
     with pytest.raises(ValueError, match=r"which files don't keep: call swinging\.simulate\(ev"):
         m.load_run(file)
 
@@ -262,7 +265,7 @@ def test_events_of_a_system_are_compiled_once(systems: Path) -> None:
     modification_times = []
     for _ in range(2):  # simulates a new process
         m = eomc.load(pendulum(), systems)
-        m._model.extensions.clear()
+        model_of(m).extensions.clear()
         m.simulate(duration=1.0, events=pendulum_events())
         (extension,) = systems.glob("swinging/.events/*/swinging/_swinging_*")
         modification_times.append(extension.stat().st_mtime_ns)
@@ -272,9 +275,9 @@ def test_events_of_a_system_are_compiled_once(systems: Path) -> None:
 @pytest.mark.parametrize(
     ("events", "message"),
     [
-        ({"a": "y"}, r"simulate\(events=\): event a: y not declared"),
+        ({"a": "y"}, r"simulate\(events=\): error: events\.a\.when: 'y' is not declared"),
         ({"turns": "theta"}, "event turns: 'turns' is an event already"),
-        ({"a": {"when": "theta", "action": "jump", "z": 1}}, "event a: z is no coordinate"),
+        ({"a": {"when": "theta", "action": "jump", "z": 1}}, r"events\.a\.z: 'z' is no coordinate"),
         ({"a": {"when": "d - 1", "action": "jump", "d": 2}}, r"=\): .*a.when: only jumps"),
         (["theta"], "give a dict"),
     ],

@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cases import SCENES
-from conftest import MODULES, Modules
-from states import QD, Q
+from support.cases import SCENES
+from support.session import MODULES, Modules
+from support.trajectories import QD, Q
+
+from eomc.runtime.package import model_of
 
 NAN = math.nan
 MASKED = np.ma.array([0.3, 1.1], mask=[0, 1])
@@ -190,6 +192,64 @@ def test_invalid_argument_of_a_run_is_named(driven: ModuleType, options: Any, me
         driven.simulate(**options)
 
 
+@pytest.mark.parametrize(
+    ("shared", "invalid", "message"),
+    [
+        ({"steps": 3}, {"q0": np.array([NAN, 0.0])}, "q0: .* is not finite"),
+        ({"steps": 3}, {"qd0": np.array([0.0, math.inf])}, "qd0: .* is not finite"),
+        ({"steps": 3}, {"q0": np.zeros((1, 2))}, "q0: shape"),
+        ({"steps": 3}, {"u": np.array([NAN])}, "u: .* is not finite"),
+        ({"steps": 3}, {"u": NAN}, "u: .* is not finite"),
+        ({"steps": 3}, {"u": np.array([[0.0], [NAN], [0.0]])}, "u.*nan.* is not finite"),
+        ({"steps": 3}, {"u": np.zeros((2, 1))}, "u: 2 rows for 3 steps"),
+        ({"steps": 3}, {"params": np.full(4, NAN)}, "params: expected .*4 finite numbers"),
+        ({"steps": 3}, {"params": {"m_c": NAN}}, "m_c: nan is not a finite number"),
+        ({"steps": 3}, {"t0": NAN}, "t0: nan is not a finite number"),
+        ({"steps": 3}, {"t0": 1e17}, "h: .* is less than what time resolves"),
+        ({"steps": 3}, {"stiff": 0}, "stiff: 0 is not True or False"),
+        ({"steps": 3}, {"estimate": 0}, "estimate: 0 is not True or False"),
+        ({"times": np.array([0.0, 0.1, 0.2])}, {"times": np.array([0.0, 0.2, 0.1])}, r"times\[2\]"),
+        ({"times": np.array([0.0, 0.1])}, {"times": np.array([0.0, NAN])}, "row of finite numbers"),
+        ({"times": np.array([0.0, 0.1])}, {"times": np.array([-0.1, 0.1])}, r"times\[0\] is -0.1"),
+        ({"times": np.array([0.1]), "duration": 0.1}, {"times": np.array([0.2])}, "behind the end"),
+        ({"times": np.array([0.1]), "duration": 0.1}, {"duration": 0.05}, "behind the end"),
+        ({"times": np.array([0.1])}, {"steps": 5}, "steps: times say where rows are"),
+        ({"duration": 0.1}, {"duration": -0.1}, "duration: -0.1 is not a time"),
+        ({"duration": 0.1}, {"steps": 5}, "steps: give steps or duration"),
+        ({"steps": 3}, {"method": "euler"}, "euler"),
+    ],
+)  # fmt: skip
+def test_later_calls_are_checked_as_the_first(
+    driven: ModuleType, shared: dict[str, Any], invalid: dict[str, Any], message: str
+) -> None:
+    """The steps of the first call are stored; those of later calls need no checks."""
+    for _ in range(2):
+        assert driven.simulate(**shared).status == "ok"
+        with pytest.raises(ValueError, match=message):
+            driven.simulate(**(shared | invalid))
+
+
+def test_stored_steps_give_the_same_runs(driven: ModuleType) -> None:
+    """Runs and requests are those of a call whose steps are not stored, bit by bit."""
+    q0, qd0, u = np.array(Q), np.array(QD), np.array([[0.1], [0.2], [0.3]])
+    plain_steps = model_of(driven).integrator.plain_steps
+    for options in (
+        {"steps": 3}, {"steps": 3, "every": 2}, {"steps": 3, "u": u}, {"steps": 3, "u": [0.5]},
+        {"steps": 3, "u": 0.5}, {"steps": 3, "t0": 0.7}, {"steps": 3, "params": {"m_c": 3.0}},
+        {"duration": 0.03}, {"times": np.array([0.0, 0.011, 0.02])}, {"steps": 0},
+        {"times": np.array([0.0, 0.011, 0.02]), "duration": 0.03}, {"duration": np.float64(0.03)},
+    ):  # fmt: skip
+        plain_steps.clear()
+        first = driven.simulate(list(Q), qd0, **options)
+        later = driven.simulate(q0, qd0, **options)
+        assert later == first and (later.t == first.t).all() and (later.u == first.u).all()
+        for name, value in first.request.to_mapping().items():
+            assert np.array_equal(getattr(later.request, name), value), name
+        q0[0] = 9.0  # the run has copies
+        assert later.request.q[0] == Q[0]
+        q0[0] = Q[0]
+
+
 @pytest.mark.parametrize("u", [1.0, [], lambda t, q, qd: 0.0])
 def test_inputs_are_refused_by_a_scene_without_inputs(cartpole: ModuleType, u: Any) -> None:
     for call in (cartpole.tau, cartpole.acceleration, cartpole.step):
@@ -246,6 +306,7 @@ def test_partially_imported_numpy_ma_is_tolerated(
     ("options", "message"),
     [
         ({"tols": 1e-9}, "simulate has no argument 'tols'; did you mean 'tol'?"),
+        ({"tolerance": 1e-9}, "simulate has no argument 'tolerance'; did you mean 'tol'?"),
         ({"t": 10}, "simulate has no argument 't'; did you mean 'duration'?"),
         ({"step": 0.01, "steps": 3}, "simulate has no argument 'step'; did you mean 'h'?"),
         ({"Duration": 1.0}, "simulate has no argument 'Duration'; did you mean 'duration'?"),
@@ -259,3 +320,9 @@ def test_unknown_argument_is_refused_with_a_suggestion(
 ) -> None:
     with pytest.raises(TypeError, match=re.escape(message)):
         driven.simulate(**options)
+
+
+def test_memory_of_checked_steps_is_limited(cartpole: ModuleType) -> None:
+    for k in range(300):
+        cartpole.simulate(steps=5, h=0.001 + 1e-6 * k)
+    assert 0 < len(model_of(cartpole).integrator.plain_steps) <= 256

@@ -12,13 +12,13 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-from conftest import SCENES, tiers
-from forks import in_a_fork
-from states import QD, Q
+from support.forks import in_a_fork
+from support.session import SCENES, tiers
+from support.trajectories import QD, Q
 
 from eomc import pipeline
 from eomc.base.errors import EomcError
-from eomc.cli import files
+from eomc.cli import options
 from eomc.report import plot
 from eomc.runtime.atomic_write import atomic_write
 from eomc.toolchain.cache import cache_texts
@@ -40,7 +40,7 @@ WRITERS: dict[str, Callable[[Any, Path], Any]] = {
     "run.gif": lambda run, file: run.animate(file),
     "run.png": lambda run, file: _figure(run, file),
     "run.pdf": lambda run, file: _figure(run, file),
-    "page.json": lambda _, file: files.write_text(file, "x" * 500),
+    "page.json": lambda _, file: options.write_text(file, "x" * 500),
     "unit.fmu": lambda _, file: write_archive(file, {"a": os.urandom(500)}),
     "scene.c": lambda _, file: write_c_folder({file.name: "x" * 500}, file.parent),
 }
@@ -48,7 +48,7 @@ WRITERS: dict[str, Callable[[Any, Path], Any]] = {
 
 def _figure(run: Any, file: Path) -> None:
     system = pipeline.read(SCENES / "cartpole_driven.toml")
-    plot.write_figure(system, plot.RunCurves(run.t, run.q, run.qd, run.energy), file)
+    plot.write_figure(system, run, file)
 
 
 def limit_file_size() -> None:
@@ -113,7 +113,7 @@ def test_full_disk_leaves_no_new_file(run: Any, tmp_path: Path) -> None:
     def write() -> None:
         limit_file_size()
         with pytest.raises(EomcError, match="File too large"):
-            files.write_new(tmp_path / "new.toml", "x" * 500)
+            options.write_new(tmp_path / "new.toml", "x" * 500)
         cache_texts(tmp_path, "scene", "what", "digest", lambda: {"a": "x" * 500})
         run.save(tmp_path / "run.csv")
 
@@ -136,7 +136,7 @@ def test_link_stays_a_link(tmp_path: Path) -> None:
     link.parent.mkdir()
     link.symlink_to(file)
     for text in ("first", "second"):
-        files.write_text(link, text)
+        options.write_text(link, text)
         assert link.is_symlink() and file.read_text(encoding="utf-8") == text
     assert [*link.parent.iterdir()] == [link]
 
@@ -146,7 +146,7 @@ def test_pipe_is_written_directly(tmp_path: Path) -> None:
     os.mkfifo(pipe)
     reader = threading.Thread(target=lambda: received.append(pipe.read_text(encoding="utf-8")))
     reader.start()
-    files.write_text(pipe, "words")
+    options.write_text(pipe, "words")
     reader.join(10)
     assert received == ["words"] and pipe.is_fifo()
 
@@ -156,7 +156,7 @@ def test_protected_file_is_not_replaced(tmp_path: Path, monkeypatch: pytest.Monk
     file.write_text(OLD, encoding="utf-8")
     monkeypatch.setattr(os, "access", lambda *_: False)  # root may write everything
     with pytest.raises(EomcError, match=r"a.txt: can't be written \(Permission denied\)"):
-        files.write_text(file, "new")
+        options.write_text(file, "new")
     assert file.read_text(encoding="utf-8") == OLD
 
 

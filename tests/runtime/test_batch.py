@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from batches import STEPS, module, starts
-from conftest import Modules, tiers
+from support.session import Modules, tiers
+from support.trajectories import STEPS, module, starts
 
 NAMES = ["cartpole", "cartpole_driven", "furuta_pendulum", "kapitza_pendulum", "foucault_pendulum"]
 
@@ -43,7 +43,7 @@ def test_order_and_threads_change_no_bit() -> None:
     assert np.array_equal(reversed_runs.q, one_thread.q[::-1])
 
 
-@pytest.mark.parametrize("real", ["double", "float"])
+@pytest.mark.parametrize("real", tiers(["double", "float"], "double"))
 @pytest.mark.parametrize("name", tiers(("cartpole", "cartpole_driven", "tumbling_box"), "cartpole"))
 def test_batch_size_changes_no_bit(name: str, real: str) -> None:
     """Partly filled tiles are computed block by block; results equal those of a larger batch."""
@@ -117,8 +117,8 @@ def test_batch_split_into_several_calls_is_identical(monkeypatch: pytest.MonkeyP
         return [m.simulate_batch(q0, qd0, u=u, **options) for u in (None, table, table[:1])]
 
     reference = simulate_all()
-    for name in ("_FIRST_POLL_SECONDS", "_POLL_SECONDS"):
-        monkeypatch.setattr(sys.modules[f"{m.__name__}._runtime.batch_work"], name, 0.0)
+    for name in ("FIRST_POLL_SECONDS", "POLL_SECONDS"):
+        monkeypatch.setattr(sys.modules[f"{m.__name__}._runtime.batch_integration"], name, 0.0)
     for expected, actual in zip(reference, simulate_all(), strict=True):
         for name in ("t", "q", "qd", "steps"):
             assert np.array_equal(getattr(expected, name), getattr(actual, name), equal_nan=True)
@@ -225,7 +225,7 @@ def test_step_batch_leaves_the_state_before_the_failed_step() -> None:
 
 
 @pytest.mark.parametrize("count", [3, 25_000])
-@pytest.mark.parametrize("name", ["kapitza_pendulum", "cartpole"])
+@pytest.mark.parametrize("name", tiers(["kapitza_pendulum", "cartpole"], "cartpole"))
 def test_instances_can_have_their_own_times(name: str, count: int) -> None:
     """Each is stepped from its own time; a scene without explicit time accepts any."""
     m = module(name)

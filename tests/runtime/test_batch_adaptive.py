@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Modules, tiers
-from eventful import BALL, built
+from support.event_scenes import BALL, built
+from support.session import Modules, tiers
 from test_adaptive import KEPLER
 
 import eomc
-from eomc.model.from_scene import from_scene
+from eomc.model.system import from_scene
 from eomc.scene.read import parse
 
 BUILDS = Path(__file__).parents[2] / "build" / "tests" / "adaptive"
@@ -78,11 +78,13 @@ def test_batch_split_into_several_calls_is_identical(
     """For any number of steps per call and any group size per thread."""
     options = {"tol": 1e-10, "times": np.linspace(0.1, 40.0, 30)}
     run = orbits.simulate_batch(*starts(21), **options)
-    module = __import__(f"{orbits.__name__}._runtime.batch_adaptive", fromlist=["batch_adaptive"])
+    module = __import__(
+        f"{orbits.__name__}._runtime.batch_integration", fromlist=["batch_integration"]
+    )
     monkeypatch.setattr(module, "next_chunk", lambda many, spent: many)
     for chunk_steps, group in ((1, 16), (7, 5), (64, 128)):
-        monkeypatch.setattr(module, "_FIRST_CHUNK_STEPS", chunk_steps)
-        monkeypatch.setattr(module, "_SMALL_GROUP_SIZE", group)
+        monkeypatch.setattr(module, "FIRST_CHUNK_STEPS", chunk_steps)
+        monkeypatch.setattr(module, "SMALL_GROUP_SIZE", group)
         assert equal_runs(orbits.simulate_batch(*starts(21), **options), run)
 
 
@@ -294,6 +296,7 @@ def test_evaluation_limit_ends_only_one_instance(orbits: ModuleType, threads: in
     assert loaded.status[1] == "too long" and np.isnan(loaded([later])[0][1]).all()
 
 
+@pytest.mark.slow
 def test_evaluation_limit_ends_instances_with_events(modules: Modules) -> None:
     """Instances with events run one after another in C, by the steps of a single run."""
     balls = modules.unoptimised(BALL.replace("bouncing", "limited_balls"))

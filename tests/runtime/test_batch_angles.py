@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from batches import STEPS, module, starts
-from conftest import Modules, tiers
+from support.session import Modules, tiers
+from support.trajectories import STEPS, module, starts
 
 
 @pytest.mark.parametrize("real", ["double", "float"])

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from batches import STEPS, module, starts
+from support.trajectories import STEPS, module, starts
 
 
 @pytest.mark.filterwarnings("ignore:overflow encountered in cast")

@@ -9,8 +9,8 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from conftest import Modules
-from eventful import BALL, G, built
+from support.event_scenes import BALL, G, built
+from support.session import Modules
 from test_adaptive_memory import ENDLESS
 
 pytestmark = pytest.mark.usefixtures("unoptimised_file")
@@ -71,7 +71,7 @@ def test_instance_number_out_of_range_is_refused(balls: ModuleType) -> None:
         with pytest.raises(IndexError, match=f"there is no instance {k}: they are 0 to 3"):
             impacts.for_instance(k)
     for k in ("impact", 1.0, None):
-        with pytest.raises(TypeError, match=r"of: .* is no number of an instance"):
+        with pytest.raises(TypeError, match=r"for_instance: .* is not the index"):
             impacts.for_instance(k)
 
 
@@ -94,8 +94,8 @@ def test_batch_split_into_several_calls_has_the_same_events(
     restitution = np.linspace(0.3, 0.9, 40)
     options = {"params": {"e": restitution}, "duration": 1.9}
     run = balls.simulate_batch(**options, threads=1)
-    monkeypatch.setattr(runtime_module(balls, "events"), "_EVENTS_EACH", 32)
-    monkeypatch.setattr(runtime_module(balls, "batch_adaptive"), "_SMALL_GROUP_SIZE", 3)
+    monkeypatch.setattr(runtime_module(balls, "events"), "EVENTS_EACH", 32)
+    monkeypatch.setattr(runtime_module(balls, "batch_integration"), "SMALL_GROUP_SIZE", 3)
     repeated = balls.simulate_batch(**options, threads=2)
     for name, events in run.events.items():
         for field in ARRAYS:
@@ -128,7 +128,7 @@ def test_endless_jumps_end_the_batch_when_memory_is_full(
 ) -> None:
     text = ENDLESS.replace("endless_jumps", "endless_batch").replace("[run]", "[run]\nbatch = true")
     endless = modules.unoptimised(text)
-    monkeypatch.setattr(runtime_module(endless, "adaptive"), "machine_memory", lambda: 1_000_000)
+    monkeypatch.setattr(runtime_module(endless, "integration"), "machine_memory", lambda: 1_000_000)
     run = endless.simulate_batch([[0.1, 0.0], [0.2, 0.0]], threads=1)
     assert set(run.status.tolist()) == {"out of memory"} and "2 out of memory" in run.message
     event_bytes = len(run.events["again"]) * 5 * 8

@@ -8,8 +8,8 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from conftest import Modules
-from eventful import BALL, built
+from support.event_scenes import BALL, built
+from support.session import Modules
 
 SPRINGS = """eomc = 1
 name = "many_springs"

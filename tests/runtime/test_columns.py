@@ -7,17 +7,19 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
-import batches
 import numpy as np
 import pytest
-from conftest import Modules
-from states import QD, Q
+from support import trajectories
+from support.session import Modules
+from support.trajectories import QD, Q
+
+from eomc.runtime.package import model_of
 
 
 @pytest.fixture(scope="session")
 def batch() -> ModuleType:
     """Cart-poles with an input that depends on time."""
-    return batches.module("cartpole_driven")
+    return trajectories.module("cartpole_driven")
 
 
 def law(t: float, q: Any, qd: Any) -> float:
@@ -37,7 +39,7 @@ def run(request: pytest.FixtureRequest, driven: ModuleType) -> Any:
     """Ten steps, five of whose rows are stored."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            driven._model.integrator, "warned", {"u"}
+            model_of(driven).integrator, "warned", {"u"}
         )  # the warning about slow functions has its own test
         return driven.simulate(Q, QD, steps=10, every=3, u=request.param, t0=0.5)
 
@@ -91,7 +93,7 @@ def test_stored_inputs_are_those_applied(driven: ModuleType) -> None:
     expected, table = tabulated.u.copy(), np.multiply(table, 0, out=table)
     assert np.array_equal(tabulated.u, expected)  # changes of the caller's table have no effect
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(driven._model.integrator, "warned", {"u"})
+        patch.setattr(model_of(driven).integrator, "warned", {"u"})
         by_function = driven.simulate(steps=10, every=3, u=lambda t, q, qd: next(calls))
     assert np.array_equal(by_function.u, expected) and np.array_equal(by_function.q, tabulated.q)
     by_signal = driven.simulate(steps=10, every=3, t0=0.5)
@@ -112,7 +114,7 @@ def test_stopped_run_has_as_many_inputs_as_rows(driven: ModuleType, steps: int) 
     """A law drives the state beyond the range of numbers."""
     inputs = [*np.arange(float(steps)), 1e308]
     with pytest.warns(RuntimeWarning, match="stopped"), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(driven._model.integrator, "warned", {"u"})
+        patch.setattr(model_of(driven).integrator, "warned", {"u"})
         run = driven.simulate(steps=20, every=3, u=lambda t, q, qd: inputs[round(t / 0.005)])
     assert (run.status, run.steps) == ("not finite", steps)
     assert run.u[:, 0].tolist() == {6: [0, 3, 1e308], 7: [0, 3, 6, 1e308]}[steps]
@@ -174,7 +176,7 @@ def test_saved_run_is_loaded_unchanged(driven: ModuleType, run: Any, tmp_path: P
     for name, column in run.to_dict().items():
         assert np.array_equal(loaded[name], column), name
     assert (loaded.evaluations, loaded.method, loaded.every) == (run.evaluations, run.method, 3)
-    if callable(run.input_source):
+    if callable(run.request.u):
         with pytest.raises(ValueError, match=r"u was a function.*simulate again"):
             loaded.estimate()
     else:
@@ -367,10 +369,10 @@ def test_repr_fits_on_a_line(
     top = modules("heavy_top")
     with pytest.warns(RuntimeWarning):
         stopped = top.simulate(top.start[0] * 0, steps=5)
-    assert repr(stopped) == "<Run of heavy_top: singular after 0 steps of 0.002 s>"
+    assert repr(stopped) == "<Trajectory of heavy_top: singular after 0 steps of 0.002 s>"
     runs = batch.simulate_batch(np.tile(Q, (3, 1)), steps=4, h=0.01)
-    expected = "<BatchRun of many_cartpole_driven: 3 instances, 12 of 12 steps of 0.01 s: 3 ok>"
-    assert repr(runs) == expected
+    expected = "many_cartpole_driven: 3 instances, 12 of 12 steps of 0.01 s: 3 ok"
+    assert repr(runs) == f"<BatchTrajectory of {expected}>"
     assert repr(driven) == "<compiled scene cartpole_driven: 2 coordinates, 1 input, 4 parameters>"
     long = repr(everything.Params(gamma=-1.25e-7))
     assert len(long) <= 80 and long.startswith("Params(m=1.5, g=9.81, ") and "more)" in long

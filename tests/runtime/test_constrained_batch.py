@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cases import SCENES
-from conftest import Modules
+from support.cases import SCENES
+from support.session import Modules
 
 COUNT, STEPS, EVERY = 3, 20, 3
 LENGTHS = np.array([0.4, 0.35, 0.3])

@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Modules, tiers
+from support.session import Modules, tiers
 
 import eomc
-from eomc.model.from_scene import from_scene
+from eomc.model.system import from_scene
+from eomc.runtime.package import model_of
 from eomc.scene.read import parse
-from eomc.verify import checks_derivatives
+from eomc.verify import equations
 from eomc.verify.comparison import Comparison
 
 WINCH = """eomc = 1
@@ -114,7 +115,7 @@ def test_derivatives_equal_differences_of_steps(
     u = INPUTS[inputs] if m.inputs else None
     q, qd = m.project(*m.start, t=t)
     for violation in (0.0, 0.01):
-        x = np.hstack([q, qd]) + violation * np.arange(2 * m._model.info.nq)
+        x = np.hstack([q, qd]) + violation * np.arange(2 * model_of(m).info.nq)
 
         def final_state(x: Any) -> Any:
             return np.hstack(m.step(*np.split(x, 2), h, t, u, method=method))
@@ -214,8 +215,8 @@ def test_wrong_derivative_fails_the_check(modules: Modules) -> None:
     m, scene_system = modules.unoptimised(SLEIGH), from_scene(parse(SLEIGH, "test.toml"))
     for module, passed in ((m, True), (PerturbedModule(), False)):
         comparison = Comparison(scene_system, module, np.random.default_rng(0), 4)
-        checks_derivatives.report_step_derivatives(comparison)
-        assert [row.passed for row in comparison.results] == [passed], comparison.results
+        results = comparison.report(equations.step_derivative_checks)
+        assert [row.passed for row in results] == [passed], results
 
 
 @pytest.mark.slow
@@ -223,5 +224,5 @@ def test_steep_velocity_dependence_passes_the_check(modules: Modules) -> None:
     """Friction is smoothed over a small part of the velocity range: narrow differences."""
     m, scene_system = modules.unoptimised(RUBBED), from_scene(parse(RUBBED, "test.toml"))
     comparison = Comparison(scene_system, m, np.random.default_rng(0), 4)
-    checks_derivatives.report_step_derivatives(comparison)
-    assert [row.passed for row in comparison.results] == [True], comparison.results
+    results = comparison.report(equations.step_derivative_checks)
+    assert [row.passed for row in results] == [True], results

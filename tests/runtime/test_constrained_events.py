@@ -8,10 +8,10 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from compilers import STRICT, compiled
+from support.compilation import STRICT, compiled
 
 import eomc
-from eomc.model.from_scene import from_scene
+from eomc.model.system import from_scene
 from eomc.scene.read import parse
 
 pytestmark = pytest.mark.usefixtures("unoptimised_file")
@@ -51,6 +51,7 @@ when = "t - 3.5"
 action = "jump"
 x_dot = "-3"
 [run]
+tolerance = 1e-9
 friction = "stick"
 duration = 4
 """

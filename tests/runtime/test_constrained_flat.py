@@ -6,8 +6,8 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from cases import SCENES
-from conftest import MODULES, Modules, tiers
+from support.cases import SCENES
+from support.session import MODULES, Modules, tiers
 from test_constrained_runs import four_bars
 
 import eomc

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cases import fast_files
 from click.testing import CliRunner
-from conftest import Modules, tiers
+from support.cases import fast_files
+from support.session import Modules, tiers
 
 import eomc
 from eomc.cli.main import main
@@ -269,7 +269,7 @@ duration = 0.1
 
 @pytest.mark.parametrize("k", [2.0, 1.0])  # with 1, `two` equals `one`
 def test_projection_scales_each_constraint_by_itself(modules: Modules, k: float) -> None:
-    """Constraints that differ by 1e40, in any order; mutants of the norm in project.c fail this."""
+    """Constraints that differ by 1e40, in any order; mutants of the norm in projection.c fail."""
     module, draw = modules.unoptimised(SCALED), np.random.default_rng(1)
     D = np.array([[1, 1 / 3, 0, 0], [1 / 3, 2, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     A = np.array([[1.1, 2.3, -3.7, 0], [1.1 * k, 2.3, -3.7, 0], [1, -1, 2, 5]])

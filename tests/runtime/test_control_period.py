@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Modules, tiers
+from support.session import Modules, tiers
 
 SCENE = """eomc = 1
 name = "balanced"

@@ -10,15 +10,14 @@ import mpmath
 import numpy as np
 import pytest
 import sympy
-from conftest import Modules, tiers
+from support.session import Modules, tiers
 
 import eomc
 from eomc.base.errors import EomcError
 from eomc.integrators.tableaux import METHODS
-from eomc.model.from_scene import from_scene
-from eomc.model.system import System
+from eomc.model.system import System, from_scene
 from eomc.scene.read import parse
-from eomc.verify import checks_derivatives, symbolic
+from eomc.verify import equations, symbolic
 from eomc.verify.comparison import Comparison
 
 HEAD = """eomc = 1
@@ -267,6 +266,30 @@ def test_inputs_and_parameters_per_state(modules: Modules, period: float | None)
             getattr(m, name)(Q, QD, u=u)
 
 
+@pytest.mark.parametrize("count", [None, 3])
+def test_matrices_are_written_into_out(modules: Modules, count: int | None) -> None:
+    m = modules.unoptimised(EXPLICIT)
+    rows = () if count is None else (count,)
+    q, qd = (np.broadcast_to(np.array(x, float), (*rows, 2)) for x in (Q, QD))
+    for compute, options in (
+        (m.linearize, {}), (m.linearize, {"closed": True}),
+        (m.discretize, {}), (m.discretize, {"control_period": 0.06}),
+    ):  # fmt: skip
+        out = np.empty((*rows, 4, 4)), np.empty((*rows, 4, 2))
+        result = compute(q, qd, out=out, **options)
+        for into, given, expected in zip(result, out, compute(q, qd, **options), strict=True):
+            assert into is given and np.array_equal(into, expected)
+        with pytest.raises(ValueError, match="out: expected a pair of arrays"):
+            compute(q, qd, out=out[0], **options)
+        with pytest.raises(ValueError, match=r"out\[1\]: expected a writeable"):
+            compute(q, qd, out=(out[0], out[0]), **options)
+        memory = np.ones(24 * (count or 1))
+        A, B = memory[: out[0].size].reshape(out[0].shape), out[1]
+        overlapping = memory[: q.size].reshape(q.shape)
+        with pytest.raises(ValueError, match="overlap"):
+            compute(overlapping, qd, out=(A, B), **options)
+
+
 def test_invalid_arguments_are_refused(modules: Modules, cartpole: ModuleType) -> None:
     m = modules.unoptimised(EXPLICIT)
     with pytest.raises(ValueError, match=r"cartpole was built without it.*discretize = true"):
@@ -291,7 +314,7 @@ def test_scene_without_discretize_has_none_of_its_code() -> None:
     for text in (LOOP, LOOP + "linearize = true\n"):
         for name, file in eomc.sources(from_scene(parse(text, "test.toml"))).files.items():
             if name.endswith((".c", ".h")):
-                for fragment in ("derivative(", "Phi", "_eliminate(", "stage_slopes"):
+                for fragment in ("derivative(", "Phi", "_eliminate(", "differentiate_"):
                     assert fragment not in file, name
     explicit = eomc.sources(from_scene(parse(EXPLICIT, "test.toml"))).files["stepped.c"]
     assert "rk4_derivative(" in explicit and "_eliminate(" not in explicit
@@ -330,6 +353,6 @@ def test_wrong_derivative_fails_the_check(modules: Modules) -> None:
     m, scene_system = modules.unoptimised(EXPLICIT), from_scene(parse(EXPLICIT, "test.toml"))
     for module, passed in ((m, True), (PerturbedModule(), False)):
         comparison = Comparison(scene_system, module, np.random.default_rng(0), 4)
-        checks_derivatives.report_step_derivatives(comparison)
-        assert [row.passed for row in comparison.results] == [passed] * 3, comparison.results
-    assert [row.name for row in comparison.results] == [f"discretize by {x}" for x in m.methods]
+        results = comparison.report(equations.step_derivative_checks)
+        assert [row.passed for row in results] == [passed] * 3, results
+    assert [row.name for row in results] == [f"discretize by {x}" for x in m.methods]

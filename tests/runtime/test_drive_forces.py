@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cases import SCENES
-from conftest import Modules
+from support.cases import SCENES
+from support.session import Modules
 from test_constrained_batch import DRIVEN
 from test_constrained_discretize import ROPE, SLEIGH
 

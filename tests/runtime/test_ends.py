@@ -7,11 +7,12 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from conftest import MODULES, Modules
-from states import QD, Q
+from support.session import MODULES, Modules
+from support.trajectories import QD, Q
 
 import eomc
 from eomc.model.system import System, symbol
+from eomc.runtime.package import model_of
 
 
 def vanishing_mass() -> System:
@@ -110,8 +111,8 @@ def test_parameters_without_inertia_are_refused(cartpole: ModuleType) -> None:
 
 def test_negative_step_in_c_goes_back(cartpole: ModuleType) -> None:
     """docs/c.md allows it; Python refuses it."""
-    model = cartpole._model
-    step, pointer, null = model.integrator.loops["rk4"][0], model.c.pointer, model.c.tools[2]
+    model = model_of(cartpole)
+    step, pointer, null = model.integrator.step_functions["rk4"], model.c.pointer, model.c.tools[2]
     q, qd = np.array(Q[:2]), np.array(QD[:2])
 
     def step_in_place(h: float) -> int:

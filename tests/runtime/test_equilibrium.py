@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cases import scene_system
-from conftest import Modules
+from support.cases import scene_system
+from support.session import Modules
 from test_balance import STICKS
 
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cases import SCENES, case_system, cases, error_of
-from conftest import ROOT, Modules, tiers
+from support.cases import SCENES, case_system, cases, error_of
+from support.session import ROOT, Modules, tiers
 
 import eomc
 from eomc.model.system import System

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Modules
 from scipy.integrate import solve_ivp
+from support.session import Modules
 
 PAGE = Path(__file__).parents[2] / "docs" / "scenes.md"
 

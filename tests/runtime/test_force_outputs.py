@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import sympy
-from conftest import Modules
-from fmus import VERSIONS, Host, exported, needs_fmpy, plain, rows
+from support.fmus import VERSIONS, Host, exported, needs_fmpy, plain, rows
+from support.session import Modules
 
 import eomc
 from eomc.base.errors import EomcError, SceneError
-from eomc.model.from_scene import from_scene
-from eomc.model.system import System, symbol
+from eomc.model.system import System, from_scene, symbol
 from eomc.report import equations
 from eomc.scene.read import parse
 from eomc.verify.check import check
@@ -78,9 +77,7 @@ def test_check_compares_both_forms_and_derivatives(real: str, tmp_path: Path) ->
     fast, portable = (eomc.load(system, tmp_path, form=form) for form in ("fast", "plain"))
     report = check(system, fast, plain=portable, states=4)
     rows = {row.name: row for row in report.results if "outputs" in row.name}
-    assert {*rows} == {
-        f"{form}outputs{part}" for form in ("", "plain C: ") for part in ("", ": C, D")
-    }
+    assert {*rows} == {"outputs", "outputs: C, D"}
     assert all(row.passed for row in rows.values()), rows
 
 
@@ -119,6 +116,7 @@ potential = "5*x**2"
 [outputs]
 holds = "lambda_x_sticks"
 [run]
+tolerance = 1e-9
 friction = "stick"
 duration = 5.0
 """
@@ -179,13 +177,13 @@ def test_other_formulas_cannot_use_multipliers() -> None:
         parse(BALL.replace('x = "F"', 'x = "F - lambda_rod"'), "test.toml")
     x = symbol("x")
     options = {"constraints": {"rod": x - 1}, "outputs": {"rate": "dot(lambda_rod)"}}
-    with pytest.raises(EomcError, match="lambda_rod, the multiplier of a constraint"):
-        eomc.sources(System.make("rate", {x: 1.0}, "x_dot**2/2", **options))
+    with pytest.raises(EomcError, match="holds forces of constraints, whose rate is not computed"):
+        System.make("rate", {x: 1.0}, "x_dot**2/2", **options)
 
 
 def test_equations_show_multipliers() -> None:
     system = from_scene(parse(BALL, "test.toml"))
-    assert "tension = -2⋅λ_rod⋅l" in equations.write_text(equations.derive(system))
+    assert "tension = -2⋅λ_rod⋅l" in str(equations.derive(system))
 
 
 @pytest.mark.slow

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import EVERYTHING
-from states import QD, Q, runs_are_equal
+from support.session import EVERYTHING
+from support.trajectories import QD, Q, runs_are_equal
 
 from eomc.emit.package import FUNCTIONS, OPTIONAL
 from eomc.model.system import System
@@ -94,7 +94,7 @@ def test_values_agree_with_the_reference(everything: ModuleType) -> None:
 
 
 def everything_system() -> System:
-    from eomc.model.from_scene import from_scene
+    from eomc.model.system import from_scene
     from eomc.scene.read import parse
 
     return from_scene(parse(EVERYTHING, "everything.toml"))

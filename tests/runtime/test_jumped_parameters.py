@@ -8,16 +8,16 @@ from types import ModuleType
 import numpy as np
 import pytest
 import sympy
-from conftest import Modules, tiers
 from scipy.integrate import solve_ivp
+from support.session import Modules, tiers
 
 import eomc
 from eomc.base.errors import SceneError
-from eomc.model.from_scene import from_scene
+from eomc.mechanism.assembly import assembled
 from eomc.model.hybrid import with_constant_parameters
-from eomc.model.system import System
-from eomc.program.assembly import assembled
+from eomc.model.system import System, from_scene
 from eomc.report.equations_text import write_equations
+from eomc.runtime.package import model_of
 from eomc.scene.read import parse
 from eomc.verify.check import check
 from eomc.verify.reference import DiscreteReference
@@ -135,7 +135,7 @@ def test_mass_length_stiffness_and_drive_change_as_in_scipy(gripper: ModuleType,
 def test_discrete_values_are_columns_of_the_run(gripper: ModuleType) -> None:
     run = gripper.simulate()
     assert gripper.coordinates == ("x", "theta", "m", "l", "k", "on")
-    assert gripper._model.info.discrete_coordinates == ("m", "l", "k", "on")
+    assert model_of(gripper).info.discrete_coordinates == ("m", "l", "k", "on")
     assert gripper.parameters == ("m_p", "g") and gripper.units["m"] == "kg"
     before_cutoff = run.t < CUTOFF
     assert set(run["k"][before_cutoff]) == {4.0} and run["k"][-1] == 8.0
@@ -410,6 +410,7 @@ batch = true
 """
 
 
+@pytest.mark.slow
 def test_size_of_discrete_values_does_not_affect_steps_and_errors(modules: Modules) -> None:
     """Regression: a distant time was the largest coordinate, relative to which errors counted."""
     small, large = (

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from conftest import Modules, tiers
+from support.session import Modules, tiers
 
 import eomc
 from eomc.base.errors import EomcError
 from eomc.cli.main import main
-from eomc.model.from_scene import from_scene
-from eomc.model.system import System
+from eomc.model.system import System, from_scene
+from eomc.runtime.package import model_of
 from eomc.scene.read import parse
-from eomc.verify import checks_inputs_outputs
+from eomc.verify import outputs
 from eomc.verify.comparison import Comparison
 
 SCENE = """eomc = 1
@@ -154,6 +154,7 @@ def test_derivatives_are_zero_beyond_limits(limited: ModuleType) -> None:
     assert np.array_equal(B_beyond[:, 2], B_within[:, 2])
 
 
+@pytest.mark.slow
 def test_command_reports_saturation(tmp_path: Path) -> None:
     (tmp_path / "limited.toml").write_text(SCENE, encoding="utf-8")
     output = (
@@ -168,8 +169,10 @@ def test_command_reports_saturation(tmp_path: Path) -> None:
 def test_scene_without_limits_has_none_of_their_code(
     limited: ModuleType, driven: ModuleType
 ) -> None:
-    assert limited._model.functions.has_limits
-    assert not driven._model.functions.has_limits and not driven.simulate(steps=3).saturated.any()
+    assert model_of(limited).functions.has_limits
+    assert (
+        not model_of(driven).functions.has_limits and not driven.simulate(steps=3).saturated.any()
+    )
     q, qd = driven.start
     assert np.array_equal(driven.applied(q, qd, 0.3), driven.signal(q, qd, 0.3))
     assert driven.applied(q, qd, u=[1e9]).tolist() == [1e9]
@@ -192,10 +195,13 @@ def test_systems_from_python_can_have_limits() -> None:
     assert limited.inputs[1].limited == limited.inputs[1].symbol
     assert str(limited.forces[0]) == "F_limited + G"
     for limits, message in (
-        ({"H": (0, 1)}, "limits of H: inputs are F, G"),
-        ({"F": 1}, "give the least and the largest value, here 1"),
-        ({"F": (2, "m")}, "2, the least value, is not below m"),
-        ({"F": ("x", 1)}, "x can't be used here: limits are made of numbers and parameters"),
+        ({"H": (0, 1)}, "limits.H: 'H' is not among the inputs"),
+        ({"F": 1}, "limits.F: must be the least and the largest value, .*, here 1"),
+        ({"F": (2, "m")}, "the least value, 2, is not below the largest"),
+        (
+            {"F": ("x", 1)},
+            "'x' can't be used here: 'limits' is made of numbers, constants and parameters",
+        ),
     ):
         with pytest.raises(EomcError, match=message):
             system(limits)
@@ -220,8 +226,7 @@ def test_check_detects_violated_limits(limited: ModuleType, perturbed: bool) -> 
     comparison = Comparison(
         from_scene(parse(BATCH, "test.toml")), module, np.random.default_rng(0), 4
     )
-    checks_inputs_outputs.report_limits(comparison)
-    (row,) = comparison.results
+    (row,) = comparison.report(outputs.limit_checks)
     assert row.name == "limits of inputs" and row.passed is not perturbed, row
 
 

@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Modules
+from support.session import Modules
+
+from eomc.runtime.package import model_of
 
 SCENE = """
 eomc = 1
@@ -104,10 +106,10 @@ class CountedCalls:
 
 @pytest.fixture
 def calls(crank: ModuleType, monkeypatch: pytest.MonkeyPatch) -> CountedCalls:
-    model: Any = crank._model
+    model: Any = model_of(crank)
     counted = CountedCalls(model.c.lib)
     monkeypatch.setattr(model.c, "lib", counted)
-    monkeypatch.setattr(model.functions, "_bound", {})
+    monkeypatch.setattr(model.functions, "c_functions", {})
     return counted
 
 

@@ -7,11 +7,11 @@ import re
 from pathlib import Path
 from types import ModuleType
 
-import cases
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from conftest import Modules
+from support import cases
+from support.session import Modules
 
 from eomc.cli.main import main
 

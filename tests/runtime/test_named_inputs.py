@@ -5,12 +5,14 @@ from __future__ import annotations
 from types import ModuleType
 from typing import Any
 
-import batches
 import numpy as np
 import pytest
 import sympy
-from states import QD, Q, runs_are_equal
+from support import trajectories
+from support.trajectories import QD, Q, runs_are_equal
 from sympy.physics.mechanics import dynamicsymbols
+
+from eomc.runtime.package import model_of
 
 S, SD = [0.3, 0.4, 0.5], [0.2, -0.1, 0.3]
 
@@ -45,7 +47,7 @@ def test_run_takes_inputs_by_name(everything: ModuleType, driven: ModuleType) ->
 
 @pytest.mark.parametrize("shape", [(), (3,), (3, 5), (1, 5)])
 def test_batch_takes_inputs_by_name(shape: tuple[int, ...]) -> None:
-    m = batches.module("cartpole_driven")
+    m = trajectories.module("cartpole_driven")
     force = np.random.default_rng(1).random(shape)
     q0 = np.tile(Q, (3, 1))
     by_name = m.simulate_batch(q0, steps=5, u={"force": force})
@@ -65,7 +67,7 @@ def test_symbols_of_sympy_are_names(driven: ModuleType) -> None:
     m_c, force = sympy.Symbol("m_c", positive=True), dynamicsymbols("force")
     run = driven.simulate(params={m_c: 3.0}, u={force: 0.5}, steps=5)
     assert runs_are_equal(run, driven.simulate(params={"m_c": 3.0}, u={"force": 0.5}, steps=5))
-    m, options = batches.module("cartpole_driven"), {"q0": [Q, Q], "steps": 5}
+    m, options = trajectories.module("cartpole_driven"), {"q0": [Q, Q], "steps": 5}
     by_symbol = m.simulate_batch(params={m_c: [2.0, 3.0]}, u={force: [0.5, 1.0]}, **options)
     assert by_symbol == m.simulate_batch(params={"m_c": [2, 3]}, u={"force": [0.5, 1.0]}, **options)
     with pytest.raises(ValueError, match="params: 'm_d' is not one of m_c"):
@@ -74,7 +76,7 @@ def test_symbols_of_sympy_are_names(driven: ModuleType) -> None:
 
 def test_instances_and_tables_are_broadcast(everything: ModuleType) -> None:
     by_name = {"u": np.arange(3.0), "push": np.arange(12.0).reshape(3, 4)}
-    inputs = everything._model.arguments.inputs_by_name(by_name)
+    inputs = model_of(everything).arguments.inputs_by_name(by_name)
     assert inputs.shape == (3, 4, 2) and inputs.flags.c_contiguous
     assert np.array_equal(inputs[..., 1], by_name["push"])
     assert np.array_equal(inputs[..., 0], np.repeat(np.arange(3.0), 4).reshape(3, 4))

@@ -11,12 +11,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import batches
 import numpy as np
 import pytest
-from cases import SCENES
-from conftest import MODULES
-from eventful import BALL, built
+from support import trajectories
+from support.cases import SCENES
+from support.event_scenes import BALL, built
+from support.session import MODULES
 
 import eomc
 from eomc.runtime.package import Identity, model_of
@@ -61,7 +61,7 @@ def versions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, by
             scene.write_text(text, encoding="utf-8")
             m = eomc.load(scene, root / "build")
             values = {
-                "module": m, "function": m.energy, "model": m._model, "run": m.simulate(),
+                "module": m, "function": m.energy, "model": model_of(m), "run": m.simulate(),
                 "params": m.Params(m=0.7), "rest": m.equilibrium(free=["theta"]),
                 "error": m.simulate().estimate(), "fault": m.MotionError("words", "singular"),
             }  # fmt: skip
@@ -172,7 +172,7 @@ def test_damaged_build_is_not_loaded(versions: dict[str, Any], folder: Path) -> 
 @pytest.fixture(scope="module")
 def values(unoptimised_file: None) -> dict[str, Any]:
     """One value of each kind."""
-    ball, batch = built(BALL), batches.module("mass_spring")
+    ball, batch = built(BALL), trajectories.module("mass_spring")
     run, runs = ball.simulate(duration=1.0), ball.simulate_batch([[0, 1], [0, 2]], duration=0.5)
     return {
         "batch": batch.simulate_batch([[0.1], [0.2]], steps=10),
@@ -229,6 +229,14 @@ def test_numbers_of_another_precision_are_refused(values: dict[str, Any]) -> Non
     changed = Identity(*pickled)._replace(extension="_another_0", dtype="float32")
     with pytest.raises(eomc.EomcError, match="pickled in float32; the build here has float64"):
         len(function(path, tuple(changed), *rest))
+
+
+@pytest.mark.parametrize("path", ["trajectory.Run._of_state", "adaptive.AdaptiveRun._of_state"])
+def test_class_of_an_earlier_version_is_refused(values: dict[str, Any], path: str) -> None:
+    function, (place, pickled, _, *rest) = values["batch"].__reduce__()
+    changed = Identity(*pickled)._replace(extension="_another_0")
+    with pytest.raises(eomc.EomcError, match="pickled by an earlier version of eomc"):
+        len(function(place, tuple(changed), path, *rest))
 
 
 def test_saved_run_with_other_events_is_refused(values: dict[str, Any], tmp_path: Path) -> None:

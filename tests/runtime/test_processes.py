@@ -14,15 +14,16 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import batches
 import numpy as np
 import pytest
-from cases import SCENES
-from conftest import MODULES, Modules
+from support import trajectories
+from support.cases import SCENES
+from support.session import MODULES, Modules
 
 import eomc
 from eomc.base.errors import Problem
 from eomc.model.system import System
+from eomc.runtime.package import model_of
 
 COPIES: dict[str, Callable[[Any], Any]] = {
     "copy": copy.copy,
@@ -42,7 +43,7 @@ def copy_value(request: pytest.FixtureRequest) -> Callable[[Any], Any]:
 @pytest.fixture(scope="session")
 def batch() -> ModuleType:
     """Cart-poles."""
-    return batches.module("cartpole")
+    return trajectories.module("cartpole")
 
 
 # --- copies ---------------------------------------------------------------------------------------
@@ -83,7 +84,7 @@ def test_run_is_copied_and_compared(driven: ModuleType, copy_value: Callable[[An
 def test_run_under_a_function_is_copied_without_the_function(driven: ModuleType) -> None:
     with (
         pytest.warns(RuntimeWarning)
-        if "u" not in driven._model.integrator.warned
+        if "u" not in model_of(driven).integrator.warned
         else memoryview(b"")
     ):
         run = driven.simulate(steps=10, u=lambda t, q, qd: [-qd[0]])
@@ -130,8 +131,8 @@ def test_motion_error_is_copied(cartpole: ModuleType, copy_value: Callable[[Any]
 
 
 def test_modules_and_their_functions_are_pickled_by_reference(cartpole: ModuleType) -> None:
-    classes = (cartpole.Params, cartpole.Run, cartpole.MotionError)
-    for value in (cartpole, cartpole._model, cartpole.D, cartpole.simulate, *classes):
+    classes = (cartpole.Params, cartpole.Trajectory, cartpole.MotionError)
+    for value in (cartpole, model_of(cartpole), cartpole.D, cartpole.simulate, *classes):
         assert pickle.loads(pickle.dumps(value)) == value
         assert copy.deepcopy(value) == value
     assert pickle.loads(pickle.dumps(cartpole)) is cartpole
@@ -195,7 +196,7 @@ def test_pool_of_processes(method: str, loaded: str, tmp_path: Path, cartpole: M
     assert process.stdout.splitlines() == [
         "MotionError not finite",
         "SceneError ",
-        "<Run of cartpole: 5 steps of 0.005 s> 5.0 4 True",
+        "<Trajectory of cartpole: 5 steps of 0.005 s> 5.0 4 True",
         "7.0 6",
     ], process.stderr
 
@@ -237,7 +238,8 @@ def test_jobs_of_joblib(tmp_path: Path, cartpole: ModuleType, batch: ModuleType)
     assert process.stdout.splitlines() == [
         "2.0 True",
         "3.0 True",
-        "[<Run of cartpole: 1 steps of 0.005 s>, <Run of cartpole: 2 steps of 0.005 s>]",
+        "[<Trajectory of cartpole: 1 steps of 0.005 s>, "
+        "<Trajectory of cartpole: 2 steps of 0.005 s>]",
     ], process.stderr
 
 
@@ -263,7 +265,7 @@ def test_module_imported_by_its_own_name_needs_no_eomc(cartpole: ModuleType) -> 
         [sys.executable, "-c", read_code], input=writer.stdout, capture_output=True, env=env
     )
     assert reader.returncode == 0, reader.stderr.decode()
-    assert reader.stdout.decode().split(">")[0] == "<Run of cartpole: 5 steps of 0.005 s"
+    assert reader.stdout.decode().split(">")[0] == "<Trajectory of cartpole: 5 steps of 0.005 s"
     assert "cartpole._runtime.status 4.0 (6,)" in reader.stdout.decode()
 
 
@@ -348,9 +350,9 @@ def test_name_unknown_to_the_scene_can_be_assigned(tmp_path: Path) -> None:
     x = sympy_symbol("x")
     system = System.make("free", {x: 1.0}, sympy_symbol("x_dot") ** 2 / 2, x**2 / 2)
     module = eomc.load(system, MODULES)
-    module._mine = module.mine = 3  # type: ignore[attr-defined]
+    module.mine = 3  # type: ignore[attr-defined]
     assert module.mine == 3
-    del module.mine, module._mine  # type: ignore[attr-defined]
+    del module.mine  # type: ignore[attr-defined]
 
 
 def sympy_symbol(name: str) -> Any:

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import eomc
-from eomc.model.from_scene import from_scene
 from eomc.model.symbols import Reaction
+from eomc.model.system import from_scene
 from eomc.scene.read import parse
 from eomc.toolchain.files import write_files
 

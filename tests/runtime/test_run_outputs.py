@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Modules, tiers
+from support.session import Modules, tiers
+
+from eomc.runtime.package import model_of
 
 SCENE = """eomc = 1
 name = "crane"
@@ -180,7 +182,9 @@ def test_scene_without_outputs_has_none_of_their_code(
     cartpole: ModuleType, crane: ModuleType
 ) -> None:
     assert cartpole.outputs == () and cartpole.simulate(steps=3).outputs == {}
-    assert not hasattr(cartpole._model.c.lib, "outputs") and hasattr(crane._model.c.lib, "outputs")
+    assert not hasattr(model_of(cartpole).c.lib, "outputs") and hasattr(
+        model_of(crane).c.lib, "outputs"
+    )
     with pytest.raises(ValueError, match=r"name them in \[outputs\]"):
         cartpole.output(*cartpole.start)
 

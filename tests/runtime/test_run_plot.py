@@ -14,11 +14,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Modules
+from support.session import Modules
 
 from eomc.runtime.labels import mathtext, rate_unit
-from eomc.runtime.notebook import html
-from eomc.runtime.plot import Curve, broken, grouped, wrapped
+from eomc.runtime.plot import Curve, broken, grouped, html, wrapped
 
 if importlib.util.find_spec("matplotlib") is None:
     pytest.skip("matplotlib is not installed", allow_module_level=True)

@@ -11,11 +11,11 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from conftest import MODULES, Modules, tiers
-from constrained import error_of, system
+from support.constraint_cases import error_of, system
+from support.session import MODULES, Modules, tiers
 
 import eomc
-from eomc.model.from_scene import from_scene
+from eomc.model.system import from_scene
 from eomc.scene.read import parse
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")

@@ -8,11 +8,11 @@ from types import ModuleType
 import numpy as np
 import pytest
 import sympy
-from conftest import Modules
+from support.session import Modules
 
 import eomc
 from eomc.base.errors import EomcError
-from eomc.runtime import starts
+from eomc.runtime import requests
 from eomc.scene import formulas
 from eomc.scene.read import parse
 from eomc.scene.scene import Scene
@@ -222,4 +222,4 @@ def test_starts_of_a_system_from_python(tmp_path: Path) -> None:
 
 def test_starts_support_all_functions_of_formulas() -> None:
     """A built module imports nothing of eomc, so it has its own table of functions."""
-    assert {*starts._FUNCTIONS} == {*formulas.FUNCTIONS} - {"dot"}
+    assert {*requests._FUNCTIONS} == {*formulas.FUNCTIONS} - {"dot"}

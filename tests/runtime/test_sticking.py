@@ -7,19 +7,18 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import cases
 import numpy as np
 import pytest
 import sympy
-from conftest import Modules
-from links import read_system
 from scipy.integrate import solve_ivp
+from support import cases
+from support.point_masses import read_system
+from support.session import Modules
 
 import eomc
 from eomc.base.errors import EomcError, SceneError
-from eomc.model.from_scene import from_scene
-from eomc.model.system import System
-from eomc.program.assembly import assembled
+from eomc.mechanism.assembly import assembled
+from eomc.model.system import System, from_scene
 from eomc.scene.read import parse
 from eomc.verify.check import check
 
@@ -56,6 +55,7 @@ F = 0.4
 kinetic = "M*x_dot**2/2 + m*((x_dot + l*theta_dot*cos(theta))**2 + (l*theta_dot*sin(theta))**2)/2"
 potential = "-m*g*l*cos(theta)"
 [run]
+tolerance = 1e-9
 friction = "stick"
 duration = 5.0
 """
@@ -252,13 +252,18 @@ def test_systems_from_python_can_stick() -> None:
     x, F, m = sympy.symbols("x F m")
     v = sympy.Symbol("x_dot")
     system = System.make(
-        "slab", {x: (0, 1)}, m * v**2 / 2, parameters={m: 2, F: 1}, friction={x: F}
+        "slab",
+        {x: (0, 1)},
+        m * v**2 / 2,
+        parameters={m: 2, F: 1},
+        friction={x: F},
+        tolerance=1e-9,
     )
     assert [c.name for c in system.coordinates] == ["x", "x_slides"]
     assert system.coordinates[1].start == 1 and system.run.tolerance == 1e-9
     for invalid, message in (
-        ({v: F}, "coordinates are x"),
-        ({x: v}, "x_dot is no parameter"),
+        ({v: F}, "'x_dot' is not among the coordinates"),
+        ({x: v}, "friction.x: 'x_dot' can't be used here: 'friction' is made of numbers"),
         ({x: -F}, "is -1, and can't be negative"),
     ):
         with pytest.raises(EomcError, match=message):
@@ -282,8 +287,7 @@ def test_sticking_takes_fewer_steps_than_smoothed_friction(
     text: str, factor: float, modules: Modules
 ) -> None:
     """The numbers of docs/adaptive.md: pytest -s tests/runtime/test_sticking.py -k fewer."""
-    smooth = text.replace('friction = "stick"', 'friction = "smooth"\ntolerance = 1e-9')
-    smooth = smooth.replace("tolerance = 1e-10\n", "").replace("dry_", "rubbed_")
+    smooth = text.replace('friction = "stick"', 'friction = "smooth"').replace("dry_", "rubbed_")
     smooth = smooth.replace('friction = "F" }', 'friction = "F", friction_width = 0.001 }')
     smooth = smooth.replace('friction = "F/', 'friction_width = 0.001\nfriction = "F/')
     exact, smoothed = (

@@ -8,8 +8,8 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from conftest import Modules, tiers
-from links import read_system
+from support.point_masses import read_system
+from support.session import Modules, tiers
 
 import eomc
 
@@ -161,6 +161,7 @@ def test_one_body_rests_while_another_moves(modules: Modules) -> None:
         assert run["y"][-1] == pytest.approx(2.5e-4 * (1 - math.cos(2)), rel=max(tol, 1e-13))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quickly_compiled")
 @pytest.mark.parametrize("text", tiers([JOINT, BOUNDED], BOUNDED), ids=["smooth", "bounded"])
 def test_portable_form_rests_too(modules: Modules, text: str, tmp_path: Path) -> None:

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cases import SCENES
-from conftest import MODULES, Modules
+from support.cases import SCENES
+from support.session import MODULES, Modules
 from test_ends import finite_time_escape, vanishing_mass
 
 import eomc
@@ -47,9 +47,9 @@ def test_rows_are_the_states_of_the_run(steppers: ModuleType, method: str) -> No
 def test_scene_with_a_tolerance_takes_fixed_steps_on_request(
     steppers: ModuleType, driven: ModuleType
 ) -> None:
-    assert type(steppers.simulate(times=TIMES)).__name__ == "AdaptiveRun"
+    assert steppers.simulate(times=TIMES).tol == 1e-9
     for options in ({"h": 0.01}, {"method": "dp8"}):
-        assert type(steppers.simulate(times=TIMES, **options)).__name__ == "TimedRun"
+        assert steppers.simulate(times=TIMES, **options).tol == 0
     assert driven.simulate(times=TIMES).h == driven.simulate(steps=1).h  # there are no others
 
 
@@ -174,8 +174,8 @@ def test_many_steps_take_no_memory(cartpole: ModuleType) -> None:
     ("arguments", "message"),
     [
         ({"times": []}, "times: expected a row of finite numbers"),
-        ({"times": [1, 0]}, "times: expected ascending times from t0 = 0 s on"),
-        ({"times": [0.5], "t0": 1.0}, "times: expected ascending times from t0 = 1 s on"),
+        ({"times": [1, 0]}, "expected ascending times from t0 = 0 s on; times.1. is 0, after 1"),
+        ({"times": [0.5], "t0": 1.0}, "times: expected .* from t0 = 1 s on; times.0. is 0.5"),
         ({"times": "x"}, "times: 'x' is not an array of numbers"),
         ({"times": "1"}, "times: '1' is not an array of numbers"),
         ({"times": [[1], [2, 3]]}, "times: .* is not an array of numbers"),

@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cases import SCENES, scene_system
-from conftest import MODULES, Modules
 from scipy.integrate import solve_ivp
-from states import QD, Q, assert_close, runs_are_equal
+from support.cases import SCENES, scene_system
+from support.session import MODULES, Modules
+from support.trajectories import QD, Q, assert_close, runs_are_equal
 
 import eomc
+from eomc.runtime.package import model_of
 from eomc.verify.symbolic import derive
 
 
@@ -38,7 +39,7 @@ def test_few_steps_by_the_fast_path_equal_those_by_the_general_path(
     """Plain arguments go directly into C; any other argument is checked first."""
     arguments = {"steps": steps, "every": 3, "t0": 0.5, **options}
     general = driven.simulate(progress=lambda finished, total: None, **arguments)
-    monkeypatch.setattr(driven._model.integrator, "run", None)
+    monkeypatch.setattr(model_of(driven).integrator, "integrate", None)
     fast = driven.simulate(**arguments)
     assert runs_are_equal(general, fast)
     for name in ("h", "steps", "status", "every", "method", "evaluations", "message"):
@@ -86,7 +87,7 @@ def test_defaults_of_a_run_are_those_of_the_scene(cartpole: ModuleType) -> None:
     assert run.energy.shape == run.jacobi.shape == (2001,)
     assert run.x.shape == (2001, 4)
     np.testing.assert_allclose(run.energy, 0, atol=1e-6)
-    assert repr(run) == "<Run of cartpole: 2000 steps of 0.005 s>"
+    assert repr(run) == "<Trajectory of cartpole: 2000 steps of 0.005 s>"
 
 
 @pytest.mark.parametrize(
@@ -235,7 +236,7 @@ def test_function_receives_time_and_state_and_may_store_them(
 
 def test_slow_python_function_is_reported_once(tmp_path: Path) -> None:
     driven = eomc.load(SCENES / "cartpole_driven.toml", MODULES)
-    driven._model.integrator.warned.discard("u")
+    model_of(driven).integrator.warned.discard("u")
     with pytest.warns(RuntimeWarning, match=r"cartpole_driven: u is a Python function.*slower"):
         driven.simulate(steps=2, u=lambda t, q, qd: 0.0)
     with warnings.catch_warnings(action="error"):

@@ -1,59 +1,42 @@
-"""Every mistake in tests/scene/bad/*.toml gives exactly the message in the file beside it.
+"""Every mistake in tests/scene/bad/*.toml gives exactly the message beside it.
 
-After an intended change `python tests/scene/test_bad_scenes.py` writes the messages again. Read
-each one as its user would before accepting it.
+After an intended change `make golden` writes the messages again. Read each one as its user would
+before accepting it.
 """
 
-from functools import cache
-from pathlib import Path
+from __future__ import annotations
 
 import pytest
+from support import bad_scenes as cases
+from support.bad_scenes import BadScene, bad_scenes, diagnose
 
-from eomc.base.errors import Problem, SceneError
-from eomc.model.from_scene import from_scene
-from eomc.scene.read import read
+from eomc.model.system import from_scene
+from eomc.scene.read import parse
 
-BAD = Path(__file__).parent / "bad"
-SCENES = sorted(BAD.glob("*.toml"))
-
-
-@cache
-def problems_and_message(file: Path) -> tuple[tuple[Problem, ...], str]:
-    """Return the problems of a scene and the message that its user reads."""
-    try:
-        warnings = from_scene(read(file)).warnings
-    except SceneError as error:
-        return error.problems, str(error)
-    return warnings, "\n".join(map(str, warnings))
+SCENES = {scene.name: scene for scene in bad_scenes()}
 
 
-def problems(file: Path) -> tuple[Problem, ...]:
-    return problems_and_message(file)[0]
+@pytest.mark.parametrize("name", cases.BASES)
+def test_scenes_without_the_mistakes_are_accepted(name: str) -> None:
+    from_scene(parse(cases.BASES[name], f"{name}.toml"))
 
 
-def message(file: Path) -> str:
-    return problems_and_message(file)[1].replace(str(file), file.name) + "\n"
+def test_names_of_cases_occur_once() -> None:
+    assert len(SCENES) == len(bad_scenes()) >= 335
 
 
-def test_every_message_has_its_scene():
-    assert len(SCENES) >= 35
-    assert {f.stem for f in BAD.glob("*.txt")} == {f.stem for f in SCENES}
+@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
+def test_message_is_the_accepted_one(scene: BadScene) -> None:
+    assert diagnose(scene)[1] == scene.message
 
 
-@pytest.mark.parametrize("file", SCENES, ids=lambda f: f.stem)
-def test_message_is_the_accepted_one(file):
-    accepted = file.with_suffix(".txt")
-    assert accepted.exists(), f"{accepted.name} is missing: python {Path(__file__).name} writes it"
-    assert message(file) == accepted.read_text(encoding="utf-8")
-
-
-@pytest.mark.parametrize("file", SCENES, ids=lambda f: f.stem)
-def test_every_problem_names_file_line_and_key(file):
-    problems_of_file = problems(file)
-    assert problems_of_file
-    lines = file.read_text(encoding="utf-8", errors="replace").split("\n")
-    for problem in problems_of_file:
-        assert problem.file == str(file)
+@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
+def test_every_problem_names_file_line_and_key(scene: BadScene) -> None:
+    problems = diagnose(scene)[0]
+    assert problems
+    lines = scene.text.decode("utf-8", errors="replace").split("\n")
+    for problem in problems:
+        assert problem.file == "scene.toml"
         assert problem.message
         layout = problem.message.startswith(("not TOML", "the file is"))
         assert problem.key or layout
@@ -65,10 +48,22 @@ def test_every_problem_names_file_line_and_key(file):
             assert problem.column < max(len(problem.source), 1) + 1
 
 
-def test_messages_fit_the_screen(file=BAD / "bound_length.toml"):
-    assert all(len(line) < 200 for line in message(file).splitlines())
+def test_messages_fit_the_screen() -> None:
+    message = diagnose(SCENES["bound_length"])[1]
+    assert all(len(line) < 200 for line in message.splitlines())
 
 
-if __name__ == "__main__":
-    for each in SCENES:
-        each.with_suffix(".txt").write_text(message(each), encoding="utf-8")
+def test_accepted_messages_replace_the_previous_ones() -> None:
+    for file in cases.FILES:
+        text = file.read_text(encoding="utf-8")
+        assert cases.accept_messages(text) == text
+        first, rest = text.split("message = '''\n", 1)
+        without = f"{first.rstrip()}\n\n" + rest.split("'''\n", 1)[1]
+        assert cases.accept_messages(without) == text
+        assert cases.accept_messages(text.replace("error: ", "error: old ")) == text
+
+
+@pytest.mark.parametrize("change", ["-a\n+c\n", "-x\n", "-b\n+a\n-x\n"])
+def test_changes_of_lines_that_do_not_occur_once_are_refused(change: str) -> None:
+    with pytest.raises(AssertionError, match="occurs"):
+        cases.apply_change("a\nb\na\n", change)

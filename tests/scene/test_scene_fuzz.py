@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eomc.base.errors import EomcError
-from eomc.model.from_scene import from_scene
+from eomc.model.system import from_scene
 from eomc.scene import formulas
 from eomc.scene.formulas import FormulaError
 from eomc.scene.read import parse

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from eomc.scene.source_map import SourceMap
+from eomc.scene.toml_text import SourceMap
 
 
 @pytest.mark.parametrize(

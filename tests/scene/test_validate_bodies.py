@@ -4,14 +4,14 @@ import math
 from pathlib import Path
 
 import pytest
-from conftest import tiers
+from support.session import tiers
 
 from eomc.base.errors import SceneError
 from eomc.scene import formulas
 from eomc.scene import read as scene
-from eomc.scene.assembly import Turn
 from eomc.scene.joints import JOINTS
-from eomc.scene.validate_values import MOMENT_TOLERANCE
+from eomc.scene.scene import Turn
+from eomc.scene.validate_tables import MOMENT_TOLERANCE
 
 SCENES = Path(__file__).parents[2] / "scenes"
 HEAD = 'eomc = 1\nname = "made"\n'
@@ -41,11 +41,13 @@ def texts(entries):
     return [formula.text for formula in entries]
 
 
+# keys that a joint requires
+REQUIRED = {"prismatic": "axis = [0, 3, 4]\n", "screw": 'pitch = "k/(2*pi)"\n'}
+
+
 @pytest.mark.parametrize("kind", JOINTS)
 def test_each_joint_is_read_in_space(kind):
-    assembly = read(
-        scene_with_joint(kind, "[0, 0, -9.81]", "axis = [0, 3, 4]\n" * (kind == "prismatic"))
-    )
+    assembly = read(scene_with_joint(kind, "[0, 0, -9.81]", REQUIRED.get(kind, "")))
     (body,) = assembly.assembly.bodies
     assert not assembly.assembly.plane
     assert body.joint == kind
@@ -72,14 +74,14 @@ def test_each_joint_is_read_in_the_plane(kind):
 
 @pytest.mark.parametrize("kind", [kind for kind, joint in JOINTS.items() if not joint.plane])
 def test_spatial_joints_are_refused_in_the_plane(kind):
-    with pytest.raises(SceneError, match=f"a {kind} joint moves in space"):
+    with pytest.raises(SceneError, match=f"a {kind} joint moves a body in space"):
         read(scene_with_joint(kind, "[0, -9.81]"))
 
 
 @pytest.mark.parametrize("kind", JOINTS)
 def test_wrong_number_of_coordinates_is_refused(kind):
     expected_count = len(JOINTS[kind].motions)
-    axis = "axis = [1, 0, 0]\n" * (kind == "prismatic")
+    axis = REQUIRED.get(kind, "")
     with pytest.raises(SceneError, match=rf"body\.link\.coordinates: a {kind} joint has"):
         read(
             scene_with_joint(
@@ -89,6 +91,17 @@ def test_wrong_number_of_coordinates_is_refused(kind):
                 expected_count - 1 if expected_count == 6 else expected_count + 1,
             )
         )
+
+
+def test_pitch_belongs_to_screws_alone():
+    (body,) = read(scene_with_joint("screw", "[0, 0, 0]", REQUIRED["screw"])).assembly.bodies
+    assert body.pitch.text == "k/(2*pi)"
+    for kind, more, why in (
+        ("screw", "", "missing: a screw joint has one"),
+        ("revolute", "pitch = 0.1\n", "a revolute joint has no pitch: remove it"),
+    ):
+        with pytest.raises(SceneError, match=rf"body\.link\.pitch: {why}"):
+            read(scene_with_joint(kind, "[0, 0, 0]", more))
 
 
 def test_values_of_a_joint_are_one_per_coordinate():
@@ -313,7 +326,7 @@ friction_width = "w"
     for values, reported in (
         ({"w": 0}, "body.bob.friction_width: is 0, and must be greater than zero"),
         ({"w": -1}, "body.bob.friction_width: is -1"),
-        ({"m": -2}, "body.bob.mass: is -2 kg"),
+        ({"m": -2}, "body.bob.mass: is -2, and"),
     ):
         with pytest.raises(SceneError, match=reported):
             scene.parse(text, parameters=values)

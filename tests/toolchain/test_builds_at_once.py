@@ -6,8 +6,8 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-from builds import CHANGED, FRESH, TEXT, gravity, leftovers, start_build
-from instrument import in_a_fork
+from support.builds import CHANGED, FRESH, TEXT, gravity, leftovers, start_build
+from support.forks import in_a_fork
 
 import eomc
 from eomc.toolchain import cache

@@ -14,15 +14,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from builds import CHANGED, TEXT, file_states, script
 from click.testing import CliRunner
-from conftest import needs, tiers
+from support.builds import CHANGED, TEXT, file_states, script
+from support.session import needs, tiers
 
 import eomc
 from eomc import pipeline
 from eomc.base import resources
 from eomc.cli.main import main
-from eomc.emit import render
+from eomc.emit.common import templates
 from eomc.toolchain import cache, compiler
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
@@ -63,7 +63,7 @@ def test_current_build_is_loaded_without_sympy(
 def bytecode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Set an empty folder as the cache of Python's bytecode, with the package's own subfolder."""
     monkeypatch.setattr(sys, "pycache_prefix", str(tmp_path / "kept"))
-    Path(importlib.util.cache_from_source(render.__file__)).parent.mkdir(parents=True)
+    Path(importlib.util.cache_from_source(templates.__file__)).parent.mkdir(parents=True)
     return tmp_path / "kept"
 
 
@@ -73,7 +73,7 @@ def test_templates_are_compiled_once_and_cached_with_bytecode(
     monkeypatch.setattr(sys, "dont_write_bytecode", False)
     system, files_of_builds = eomc.read(scene), []
     for k in range(3):
-        render.environment.cache_clear()
+        templates.environment.cache_clear()
         files_of_builds.append(eomc.sources(system).files)
         files = list(bytecode.rglob("eomc-template-*.cache"))
         assert len(files) > 5
@@ -85,7 +85,7 @@ def test_templates_are_compiled_once_and_cached_with_bytecode(
 def test_no_bytecode_is_written_if_python_may_not(
     scene: Path, bytecode: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    render.environment.cache_clear()
+    templates.environment.cache_clear()
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     eomc.sources(eomc.read(scene))
     assert not [path for path in bytecode.rglob("*") if path.is_file()]
@@ -159,6 +159,7 @@ def test_bytecode_of_the_previous_build_is_not_used(
     assert all(int(file.stat().st_mtime) > int(future) for file in files)
 
 
+@pytest.mark.slow
 def test_some_previous_builds_are_archived(
     scene: Path, root: Path, existing_build: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -279,6 +280,7 @@ def test_relative_root_is_valid_in_another_current_folder(
         scene.write_text(CHANGED, encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_system_with_a_replaced_part_is_rebuilt(tmp_path: Path) -> None:
     system = eomc.System.make("swing", {"a": 1.0}, "a_dot**2/2", "-cos(a)")
     assert eomc.load(system, tmp_path).methods == ("rk4",)

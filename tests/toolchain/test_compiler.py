@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from builds import CHANGED
-from conftest import needs
+from support.builds import CHANGED
+from support.session import needs
 
 import eomc
 from eomc.toolchain import compiler

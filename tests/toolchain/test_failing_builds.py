@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from builds import FRESH, TEXT, file_states, gravity, leftovers, script, start_build
-from conftest import tiers
-from instrument import in_a_fork
+from support.builds import FRESH, TEXT, file_states, gravity, leftovers, script, start_build
+from support.forks import in_a_fork
+from support.session import tiers
 
 import eomc
 
@@ -114,7 +114,7 @@ def test_build_that_cannot_be_moved_leaves_all_files_unchanged(
     """Header, C, Python's files and library are unchanged, whichever of them the move fails at."""
     folder, move, moved_files = root / "simple_pendulum", os.replace, list[str]()
     (folder / "_runtime" / "status.py").write_text("of another version", encoding="utf-8")
-    (folder / "_runtime" / "inputs.py").unlink()  # the previous build had no such file
+    (folder / "_runtime" / "events.py").unlink()  # the previous build had no such file
     before, last = contents(folder), ""
 
     def failing_replace(old: Path, new: Path) -> None:

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cases import SCENES
-from conftest import tiers
-from fmus import BALL, FLOAT, RIG, VERSIONS, Host, exported, needs_fmpy, plain, rows
+from support.cases import SCENES
+from support.fmus import BALL, FLOAT, RIG, VERSIONS, Host, exported, needs_fmpy, plain, rows
+from support.session import tiers
 
-from eomc.model.from_scene import from_scene
+from eomc.model.system import from_scene
 from eomc.scene.read import parse
 
 KINDS = ("CoSimulation", "ModelExchange")
@@ -664,8 +664,8 @@ def test_fmu_compiles_for_other_machines(target: str, version: int, tmp_path: Pa
     pytest.importorskip("ziglang", reason="ziglang is not installed: pip install '.[cc]'")
     import sys
 
-    from compilers import compiled
     from fmpy import extract
+    from support.compilation import compiled
 
     extract(str(exported(BALL, version)), str(tmp_path))
     # the headers of the standard declare functions without prototypes
@@ -711,6 +711,7 @@ action = "jump"
 x = "x - 5"
 x_dot = "1"
 [run]
+tolerance = 1e-9
 duration = 3
 """
 

@@ -7,8 +7,8 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from conftest import needs
-from fmus import BALL, VERSIONS, Host, exported, extracted, needs_fmpy
+from support.fmus import BALL, VERSIONS, Host, exported, extracted, needs_fmpy
+from support.session import needs
 
 pytestmark = pytest.mark.slow
 NAMES = ("y", "x", "y_dot", "x_dot", "energy.total")

@@ -11,8 +11,8 @@ import venv
 from pathlib import Path
 
 import pytest
-from cases import SCENES
-from conftest import ROOT
+from support.cases import SCENES
+from support.session import ROOT
 from toolchain.test_packaging import build_distribution
 
 from eomc import pipeline

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from conftest import ROOT
+from support.session import ROOT
 
 from eomc.base.errors import EomcError
 from eomc.toolchain import cache, extension

@@ -12,8 +12,8 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from cases import SCENES
-from conftest import ROOT
+from support.cases import SCENES
+from support.session import ROOT
 
 pytestmark = pytest.mark.slow
 RUN = "import eomc; print(eomc.__file__); print(eomc.load('cartpole.toml').simulate().status)"

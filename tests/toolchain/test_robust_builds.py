@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from builds import gravity, leftovers, script
-from instrument import in_a_fork
+from support.builds import gravity, leftovers, script
+from support.forks import in_a_fork
 
 import eomc
 from eomc.toolchain import cache

@@ -15,8 +15,8 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from cases import SCENES
 from click.testing import CliRunner
+from support.cases import SCENES
 from toolchain.test_installed import create_environment, environment, pip
 
 from eomc import pipeline
@@ -204,7 +204,7 @@ def run(q, qd, h, steps, p):
 
 
 q, qd = cartpole.start
-status = run(q, qd, cartpole._model.info.h, 2000, np.array([*cartpole.defaults.values()]))
+status = run(q, qd, 0.005, 2000, np.array([*cartpole.defaults.values()]))
 print(status, abs(np.hstack([q, qd]) - cartpole.simulate().x[-1]).max())
 """
 SCIPY = """

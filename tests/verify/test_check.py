@@ -6,15 +6,14 @@ import json
 import math
 from functools import cache
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
 import sympy
-from cases import scene_system
-from conftest import Modules, tiers
-from stand_in import (
-    StandIn,
+from support.cases import scene_system
+from support.fake_module import (
+    FakeModule,
     delay_time,
     ignore,
     modify,
@@ -22,16 +21,16 @@ from stand_in import (
     set_,
     simplify_reference,
 )
+from support.session import Modules, tiers
 
-from eomc.model.from_scene import from_scene as system_of
 from eomc.model.system import System, symbol
+from eomc.model.system import from_scene as system_of
 from eomc.scene.read import parse
-from eomc.verify import sampling
+from eomc.verify import convergence, equations, runs, sampling
 from eomc.verify import symbolic as references
-from eomc.verify.check import add_value_checks, check
-from eomc.verify.comparison import Comparison
-from eomc.verify.convergence import Convergence
-from eomc.verify.report import CheckReport, Measurement
+from eomc.verify.check import TABLES, check
+from eomc.verify.comparison import CheckReport, Comparison, Measurement
+from eomc.verify.convergence import Convergence, advice_checks
 from eomc.verify.sampling import LARGE
 from eomc.verify.symbolic import SymbolicReference, derive
 
@@ -114,7 +113,7 @@ def failed_checks(report: CheckReport) -> set[str]:
 @cache
 def report_of_mass_spring() -> CheckReport:
     """The report of a mass on a spring, which several tests read."""
-    return check(scene_system("mass_spring"), StandIn(reference("mass_spring")), states=4)
+    return check(scene_system("mass_spring"), FakeModule(reference("mass_spring")), states=4)
 
 
 @pytest.mark.parametrize(
@@ -132,7 +131,7 @@ def report_of_mass_spring() -> CheckReport:
 )
 def test_correct_module_passes(name: str) -> None:
     """The simplified equations round differently."""
-    report = check(scene_system(name), StandIn(simplify_reference(reference(name))))
+    report = check(scene_system(name), FakeModule(simplify_reference(reference(name))))
     assert report.passed, report.table()
     values = [row for row in report.results if row.unit == "units of rounding"]
     assert max(row.error for row in values) < 2
@@ -142,6 +141,7 @@ def test_correct_module_passes(name: str) -> None:
 
 # Checks of runs with several step sizes, which take most of the time.
 OF_RUNS = {"order of rk4", "power balance"}
+WITHOUT_ORDERS = tuple(table for table in TABLES if table is not convergence.checks)
 LONG = {what for what, (_, _, rows) in BROKEN.items() if rows & OF_RUNS}
 # Each check once; test_breaks and tests/physics/test_steppers cover an order that is too low.
 QUICK = (
@@ -156,12 +156,15 @@ def check_broken(
     what: str, monkeypatch: pytest.MonkeyPatch, states: int | None = None
 ) -> CheckReport:
     """Check a broken module, without checks of runs that do not concern the breakage."""
-    without = "add_advice_check" if what in LONG else "add_convergence_checks"
-    monkeypatch.setattr(Comparison, without, lambda *_: None)
     name, break_, _ = BROKEN[what]
-    module = StandIn(reference(name))
+    module = FakeModule(reference(name))
     break_(module)
-    return check(scene_system(name), module, states=states)
+    tables = TABLES
+    if what in LONG:
+        monkeypatch.setattr(convergence, "advice_checks", lambda *_: ())
+    else:
+        tables = WITHOUT_ORDERS
+    return check(scene_system(name), module, states=states, tables=tables)
 
 
 @pytest.mark.parametrize("what", tiers(BROKEN, *QUICK))
@@ -182,7 +185,7 @@ def as_if_large(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("name", tiers(("cartpole_driven", "foucault_pendulum"), "cartpole_driven"))
 def test_correct_module_passes_as_if_large(name: str, as_if_large: None) -> None:
-    report = check(scene_system(name), StandIn(simplify_reference(reference(name))))
+    report = check(scene_system(name), FakeModule(simplify_reference(reference(name))))
     assert report.passed, report.table()
     assert report.states == LARGE.states
     assert report.reference == "Taylor arithmetic"
@@ -210,11 +213,10 @@ def test_wrong_module_fails_as_if_large(
     assert BROKEN[what][2] <= failed_checks(report), report.table()
 
 
-def test_exception_of_a_module_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Comparison, "add_convergence_checks", lambda _: None)
-    module = StandIn(reference("mass_spring"))
+def test_exception_of_a_module_is_reported() -> None:
+    module = FakeModule(reference("mass_spring"))
     module.g = lambda *place, **how: {}["k"]  # type: ignore[method-assign]
-    report = check(scene_system("mass_spring"), module, states=4)
+    report = check(scene_system("mass_spring"), module, states=4, tables=WITHOUT_ORDERS)
     assert failed_checks(report) == {"g", "bias = C qd + g"}
     assert "KeyError: 'k'" in report.table()
 
@@ -224,7 +226,7 @@ def test_order_is_measured_between_discontinuities_of_friction() -> None:
     """The order shows in spans between two discontinuities; the check used to take any span."""
     x, v = symbol("x"), symbol("x_dot")
     system = System.make("dry", [x], v**2 / 2, x**2 / 2, forces={x: -sympy.sign(v)}, h=0.05)
-    report = check(system, StandIn(derive(system)), states=8)
+    report = check(system, FakeModule(derive(system)), states=8)
     assert report.passed, report.table()
     order = next(row for row in report.results if row.name == "order of rk4")
     assert order.judged and 3.5 < order.error < 4.5
@@ -236,10 +238,10 @@ def test_order_is_not_judged_across_discontinuities(monkeypatch: pytest.MonkeyPa
     """
     x, v, low = symbol("x"), symbol("x_dot"), lambda *_: Measurement(1.0)
     monkeypatch.setattr(Convergence, "order", low)
-    monkeypatch.setattr(Comparison, "add_advice_check", lambda *_: None)
+    monkeypatch.setattr(convergence, "advice_checks", lambda *_: ())
     for force, passed in ((sympy.sign(v), True), (sympy.tanh(v), False)):
         system = System.make("dry", [x], v**2 / 2, 0, forces={x: -force}, h=0.05)
-        report = check(system, StandIn(derive(system)), states=4)
+        report = check(system, FakeModule(derive(system)), states=4)
         (row,) = (row for row in report.results if row.name == "order of rk4")
         assert row.passed == passed and row.judged != passed
         assert ("not to be expected with sign" in " ".join(report.table().split())) == passed
@@ -248,8 +250,8 @@ def test_order_is_not_judged_across_discontinuities(monkeypatch: pytest.MonkeyPa
 def test_unmeasurable_order_is_reported_as_not_judged(monkeypatch: pytest.MonkeyPatch) -> None:
     unseen = Measurement(math.nan, "too few halvings")
     monkeypatch.setattr(Convergence, "order", lambda *_: unseen)
-    monkeypatch.setattr(Comparison, "add_advice_check", lambda *_: None)
-    report = check(scene_system("mass_spring"), StandIn(reference("mass_spring")), states=4)
+    monkeypatch.setattr(convergence, "advice_checks", lambda *_: ())
+    report = check(scene_system("mass_spring"), FakeModule(reference("mass_spring")), states=4)
     assert report.passed
     assert "not judged: too few halvings" in " ".join(report.table().split())
     (row,) = (row for row in report.as_dict()["rows"] if not row["judged"])
@@ -260,7 +262,7 @@ def test_singular_initial_state_is_skipped() -> None:
     r, theta, m = symbol("r"), symbol("theta"), symbol("m")
     speed = symbol("r_dot") ** 2 + r**2 * symbol("theta_dot") ** 2
     system = System.make("polar", {r: 0.0, theta: 0.0}, m * speed / 2, m * r**2, parameters={m: 2})
-    report = check(system, StandIn(derive(system)), states=8)
+    report = check(system, FakeModule(derive(system)), states=8)
     assert report.passed, report.table()
     assert report.rejected >= 1
 
@@ -268,35 +270,44 @@ def test_singular_initial_state_is_skipped() -> None:
 def test_coordinate_without_inertia_is_reported() -> None:
     x, y = symbol("x"), symbol("y")
     system = System.make("lazy", [x, y], symbol("x_dot") ** 2 / 2, x**2 + y**2)
-    report = check(system, StandIn(derive(system)), states=4)
+    report = check(system, FakeModule(derive(system)), states=4)
     assert failed_checks(report) == {"states"}
     assert report.states == 0
 
 
-def test_rounding_of_cancelling_terms_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rounding_of_cancelling_terms_is_no_error() -> None:
     """C is 0 only as the difference of equal terms, so its rounding is not compared with 0."""
-    monkeypatch.setattr(Comparison, "add_convergence_checks", lambda _: None)
     a, b = symbol("a"), symbol("b")
     angle, rate = a + b, symbol("a_dot") + symbol("b_dot")
     kinetic = sum((f(angle).diff(a) * rate) ** 2 for f in (sympy.sin, sympy.cos)) * 7 / 2
     system = System.make("ring", {a: 0.3, b: 0.1}, kinetic + symbol("a_dot") ** 2 / 3, 0)
-    report = check(system, StandIn(simplify_reference(derive(system))), states=8)
+    module = FakeModule(simplify_reference(derive(system)))
+    report = check(system, module, states=8, tables=WITHOUT_ORDERS)
     assert report.passed, report.table()
 
 
-def test_each_method_has_a_check_of_one_step() -> None:
-    for methods in (("rk4", "dp8", "gauss4"), ("gauss8", "euler")):
-        names = list[str]()
-        comparison = SimpleNamespace(
-            methods=methods, add_check=lambda name, *_, names=names: names.append(name),
-            value_error=len, rk4_step_error=None, run_error=None, run_energy_error=None,
-            step_error=len,
-        )  # fmt: skip
-        add_value_checks(cast(Comparison, comparison))
-        assert [n.removeprefix("one step of ") for n in names if "one step of" in n] == [
-            m for m in methods if m != "rk4"
-        ]
-        assert ("one step" in names) == ("rk4" in methods)
+def test_each_method_has_checks_of_one_step_and_of_a_run() -> None:
+    module: Any = FakeModule(reference("mass_spring"))
+    comparison = Comparison(scene_system("mass_spring"), module, np.random.default_rng(0), 4)
+    for methods in (("rk4", "dp8", "gauss4"), ("rk4", "gauss8", "euler")):
+        comparison.methods = methods
+        names = {check.name for check in runs.checks(comparison)}
+        assert {"one step", "run", *(f"one step of {m}" for m in methods[1:])} < names
+        assert {f"run by {m}" for m in methods[1:]} < names
+
+
+def test_portable_form_counts_if_its_error_is_larger() -> None:
+    """A line of the report applies to both forms of C, and names the portable one if it fails."""
+    modules = [FakeModule(reference("mass_spring")) for _ in range(2)]
+    table = (equations.checks,)
+    for bad, name in ((0, "g"), (1, "plain C: g")):
+        right, wrong = modules[bad].g, modify("g", np.negative)
+        wrong(modules[bad])
+        report = check(
+            scene_system("mass_spring"), modules[0], plain=modules[1], states=4, tables=table
+        )
+        modules[bad].g = right  # type: ignore[method-assign]
+        assert name in failed_checks(report) <= {name, "bias = C qd + g"}
 
 
 def test_report_as_json_and_as_table() -> None:
@@ -311,7 +322,7 @@ def test_report_as_json_and_as_table() -> None:
 
 @pytest.mark.slow
 def test_report_is_reproducible_for_a_seed() -> None:
-    module = StandIn(reference("cartpole"))
+    module = FakeModule(reference("cartpole"))
     first, second = (check(scene_system("cartpole"), module, states=4) for _ in range(2))
     assert first == second
     assert first != check(scene_system("cartpole"), module, states=4, seed=1)
@@ -359,9 +370,8 @@ linearize = "parameters"
     ],
 )
 def test_derivatives_are_compared_with_finite_differences(
-    modules: Modules, monkeypatch: pytest.MonkeyPatch, real: str, wrong: str
+    modules: Modules, real: str, wrong: str
 ) -> None:
-    monkeypatch.setattr(Comparison, "add_convergence_checks", lambda _: None)
     text = f'{SLOPES}real = "{real}"\n'
     module = modules.unoptimised(text)
 
@@ -376,7 +386,7 @@ def test_derivatives_are_compared_with_finite_differences(
         def sensitivity(self, *place: Any, **how: Any) -> Any:
             return module.sensitivity(*place, **how) * (-1 if wrong == "sensitivity" else 1)
 
-    report = check(system_of(parse(text)), WrongModule(), states=4)
+    report = check(system_of(parse(text)), WrongModule(), states=4, tables=WITHOUT_ORDERS)
     rows = {"": set(), "sensitivity": {"sensitivity"}}.get(wrong, {"linearize", "closed loop"})
     assert failed_checks(report) == rows, report.table()
     assert {"linearize", "sensitivity"} <= {row.name for row in report.results}
@@ -390,12 +400,11 @@ def test_advice_on_h_is_compared_with_runs(modules: Modules, name: str) -> None:
         comparison = Comparison(
             system, ModuleWithScaledAdvice(modules(name), by), np.random.default_rng(0), 4
         )
-        comparison.add_advice_check("rk4")
-        (row,) = comparison.results
+        (row,) = comparison.report(lambda of: advice_checks(of, Convergence(of)))
         assert row.name == "h of rk4" and row.passed == good, row
         assert not good or row.error in (0.25, 0.5, 1, 2)
 
 
 def test_without_oscillation_there_is_no_advice_to_check() -> None:
     (row,) = (r for r in report_of_mass_spring().results if r.name == "h of rk4")
-    assert row.passed and math.isinf(row.error) and row.unit.startswith("no limit to test")
+    assert row.passed and math.isinf(row.error) and row.unit.startswith("nothing to test")

@@ -10,16 +10,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cases import scene_system
-from conftest import Modules
+from support.cases import scene_system
+from support.session import Modules
+from support.template_checks.adaptive import BATCH_LIMIT, AdaptiveBatchChecks, AdaptiveRefusalChecks
+from support.template_checks.refusals import RefusalChecks
 
-from eomc.model.from_scene import from_scene
+from eomc.model.system import from_scene
 from eomc.scene.read import parse
-from eomc.verify import checks_adaptive
-from eomc.verify.checks_adaptive import BATCH_LIMIT, AdaptiveBatchChecks, AdaptiveRefusalChecks
-from eomc.verify.checks_refusals import RefusalChecks
-from eomc.verify.comparison import Comparison
-from eomc.verify.report import Measurement
+from eomc.verify import runs
+from eomc.verify.comparison import Comparison, Measurement
 
 # the intervals between jumps shrink: they accumulate before 0.17 s
 ENDLESS = """eomc = 1
@@ -86,8 +85,8 @@ def test_accumulating_events_are_not_simulated_beyond_the_compared_time(
     endless: Comparison,
 ) -> None:
     """A full run of 5 s would need memory as long as it continued."""
-    checks_adaptive.report_runs(endless)
-    assert [row.passed for row in endless.results] == [True] * 3, endless.results
+    results = endless.report(runs.adaptive_checks)
+    assert [row.passed for row in results] == [True] * 3, results
 
 
 def test_check_of_stiff_steps_takes_stiff_steps(endless: Comparison) -> None:
@@ -98,11 +97,12 @@ def test_check_of_stiff_steps_takes_stiff_steps(endless: Comparison) -> None:
         Interrupted = endless.module.Interrupted
 
         def simulate(self, *args: Any, **how: Any) -> Any:
-            run = endless.module.simulate(*args, **how)
+            run = module.simulate(*args, **how)
             stiff.append(run.stiff_steps == run.steps)
             return run
 
-    checks_adaptive._run_error(endless, RecordingModule(), 1e-6, True, endless.expected[0].state)
+    module, endless.module = endless.module, RecordingModule()
+    runs.adaptive_error(1e-6, True, endless, endless.expected[0])
     assert stiff.count(True) >= 3 and stiff.count(False) == 1
 
 
@@ -113,8 +113,8 @@ def test_constant_inputs_apply_to_all_stages(modules: Modules) -> None:
     system = scene_system("cartpole_driven")
     driven = Comparison(system, modules("cartpole_driven"), np.random.default_rng(1), 4)
     s = replace(driven.expected[0].state, u=np.array([0.5]))
-    x, times = np.array([*s.q, *s.qd]), np.array([2.5])
-    rows, _ = checks_adaptive._reference_states(driven, s, x, times, times)
+    times = np.array([2.5])
+    rows, _ = runs.accurate_states(driven, s, times, times)
     assert np.isfinite(rows).all()
 
 

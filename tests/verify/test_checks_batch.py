@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import Modules, tiers
+from support.session import Modules, tiers
+from support.template_checks.batches import STEPS, BatchChecks
+from support.template_checks.runs import RunChecks, run_in_c
 
-from eomc.model.from_scene import from_scene
+from eomc.model.system import from_scene
 from eomc.scene.read import parse
-from eomc.verify.checks_batch import STEPS, BatchChecks
-from eomc.verify.checks_runs import RunChecks, run_in_c
 from eomc.verify.comparison import Comparison
 
 # forces that depend on a slide; with a cosine of it they have no digit at 1e304

@@ -7,12 +7,11 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from conftest import Modules
+from support.session import Modules
 
-from eomc.model.from_scene import from_scene
-from eomc.model.system import System, symbol
+from eomc.model.system import System, from_scene, symbol
 from eomc.scene.read import parse
-from eomc.verify import checks_events, checks_inputs_outputs
+from eomc.verify import outputs, runs
 from eomc.verify.check import check
 from eomc.verify.comparison import Comparison
 
@@ -54,8 +53,8 @@ def ball(modules: Modules) -> ModuleType:
 
 def failed_checks(system: System, ball: ModuleType) -> set[str]:
     comparison = Comparison(system, ball, np.random.default_rng(0), 4)
-    checks_events.report_functions(comparison)
-    return {row.name for row in comparison.results if not row.passed}
+    results = comparison.report(runs.event_function_checks)
+    return {row.name for row in results if not row.passed}
 
 
 def test_correct_module_passes(ball: ModuleType) -> None:
@@ -103,7 +102,7 @@ tolerance = 1e-9
 def test_complex_values_of_formulas_are_not_compared(modules: Modules) -> None:
     system = from_scene(parse(ODD))
     comparison = Comparison(system, modules.unoptimised(system), np.random.default_rng(0), 8)
-    checks_events.report_functions(comparison)
-    checks_inputs_outputs.report_outputs(comparison)
-    assert {"events", "jumps", "outputs"} <= {row.name for row in comparison.results}
-    assert all(row.passed for row in comparison.results)
+    tables = (runs.event_function_checks, outputs.checks)
+    results = [row for table in tables for row in comparison.report(table)]
+    assert {"events", "jumps", "outputs"} <= {row.name for row in results}
+    assert all(row.passed for row in results)

@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import tiers
-from instrument import Shipped, in_a_fork
-from mutants import variant
+from support.compilation import Shipped
+from support.forks import in_a_fork
+from support.mutants import variant
+from support.session import tiers
+from support.template_checks.newton import MAX_EXTRA_SWEEPS, NewtonChecks
 
 from eomc.integrators.tableaux import METHODS
-from eomc.verify import checks_newton, one_step, symbolic
+from eomc.verify import one_step, symbolic
 from eomc.verify.comparison import Comparison
 
 SYSTEM = variant("pendulum_dp8_gauss8")
@@ -44,7 +46,7 @@ def extra_iterations(shipped: Shipped, source: str) -> float:
 
     def measure() -> float:
         comparison = Comparison(SYSTEM, shipped.load(), np.random.default_rng(0), 4)
-        result = checks_newton.NewtonChecks(comparison).extra_sweeps("gauss8")
+        result = NewtonChecks(comparison).extra_sweeps("gauss8")
         assert isinstance(result, float)
         return result if math.isfinite(result) else 1e9
 
@@ -62,10 +64,7 @@ def test_correct_derivatives_need_few_iterations(shipped: Shipped) -> None:
 def test_wrong_derivatives_need_many_iterations(shipped: Shipped, what: str) -> None:
     right, wrong = WRONG[what]
     assert shipped.source.count(right) == 1
-    assert (
-        extra_iterations(shipped, shipped.source.replace(right, wrong))
-        > checks_newton.MAX_EXTRA_SWEEPS
-    )
+    assert extra_iterations(shipped, shipped.source.replace(right, wrong)) > MAX_EXTRA_SWEEPS
 
 
 def test_newton_and_fixed_point_iteration_give_the_same_step() -> None:

@@ -1,4 +1,4 @@
-"""The check compares outputs with formulas in eighty digits, and detects errors."""
+"""The check compares outputs with formulas evaluated with dual numbers, and detects errors."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Modules
+from support.session import Modules
 
-from eomc.model.from_scene import from_scene
-from eomc.program.assembly import assembled
+from eomc.mechanism.assembly import assembled
+from eomc.model.system import from_scene
 from eomc.scene.read import parse
-from eomc.verify import checks_inputs_outputs
+from eomc.verify import outputs
 from eomc.verify.comparison import Comparison
 
 SCENE = """eomc = 1
@@ -67,9 +67,9 @@ class Wrong:
 def test_wrong_outputs_fail(modules: Modules, wrong: dict[str, float], failed: list[str]) -> None:
     system, module = from_scene(parse(SCENE, "test.toml")), modules.unoptimised(SCENE)
     comparison = Comparison(system, Wrong(module, **wrong), np.random.default_rng(0), None)
-    checks_inputs_outputs.report_outputs(comparison)
-    assert [row.name for row in comparison.results] == ["outputs", "outputs: C, D"]
-    assert [row.name for row in comparison.results if not row.passed] == failed, comparison.results
+    results = comparison.report(outputs.output_checks)
+    assert [row.name for row in results] == ["outputs", "outputs: C, D"]
+    assert [row.name for row in results if not row.passed] == failed, results
 
 
 ON_A_ROD = """eomc = 1
@@ -111,8 +111,8 @@ def test_wrong_outputs_of_multipliers_fail(
         modules.unoptimised(ON_A_ROD),
     )
     comparison = Comparison(system, Wrong(module, **wrong), np.random.default_rng(0), None)
-    checks_inputs_outputs.report_outputs(comparison)
-    assert [row.name for row in comparison.results if not row.passed] == failed, comparison.results
+    results = comparison.report(outputs.output_checks)
+    assert [row.name for row in results if not row.passed] == failed, results
 
 
 @pytest.mark.slow
@@ -124,8 +124,8 @@ def test_derivatives_by_parameters_that_jumps_change(modules: Modules) -> None:
     text += '[[event]]\nname = "sheds"\nwhen = "t - 1"\naction = "jump"\nm = "m/2"\n'
     system, module = assembled(from_scene(parse(text, "test.toml"))), modules.unoptimised(text)
     comparison = Comparison(system, module, np.random.default_rng(0), None)
-    checks_inputs_outputs.report_outputs(comparison)
-    assert [row.passed for row in comparison.results] == [True, True], comparison.results
+    results = comparison.report(outputs.output_checks)
+    assert [row.passed for row in results] == [True, True], results
 
 
 CANCELLING = """eomc = 1
@@ -149,8 +149,8 @@ load = "k*x + x_ddot"
 def test_output_that_cancels_with_an_acceleration_passes(modules: Modules) -> None:
     system, module = from_scene(parse(CANCELLING, "test.toml")), modules.unoptimised(CANCELLING)
     comparison = Comparison(system, module, np.random.default_rng(0), None)
-    checks_inputs_outputs.report_outputs(comparison)
-    assert {row.name: row.passed for row in comparison.results} == {"outputs": True}
+    results = comparison.report(outputs.output_checks)
+    assert {row.name: row.passed for row in results} == {"outputs": True}
 
 
 @pytest.mark.parametrize("wrong", [{}, {"F": 1e-7}])
@@ -159,6 +159,9 @@ def test_wrong_derivatives_by_parameters_fail(modules: Modules, wrong: dict[str,
     text += '[run]\nlinearize = "parameters"\n'
     system, module = from_scene(parse(text, "test.toml")), modules.unoptimised(text)
     comparison = Comparison(system, Wrong(module, **wrong), np.random.default_rng(0), None)
-    checks_inputs_outputs.report_outputs(comparison)
-    results = {row.name: row.passed for row in comparison.results}
-    assert results == {"outputs": True, "outputs: C, D": True, "outputs: by parameters": not wrong}
+    results = comparison.report(outputs.output_checks)
+    assert {row.name: row.passed for row in results} == {
+        "outputs": True,
+        "outputs: C, D": True,
+        "outputs: by parameters": not wrong,
+    }

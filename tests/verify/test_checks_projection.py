@@ -8,13 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cases import scene_system
-from stand_in import StandIn
+from support.cases import scene_system
 
 from eomc.verify import symbolic
-from eomc.verify.checks_constraints import ProjectionChecks, report_projection
-from eomc.verify.comparison import Comparison
-from eomc.verify.report import CheckResult
+from eomc.verify.comparison import CheckResult, Comparison
+from eomc.verify.constraints import projection_checks
 
 SYSTEM = scene_system("pendulum_xy")
 
@@ -36,33 +34,28 @@ class Projecting:
         return result
 
 
-def rows(monkeypatch: pytest.MonkeyPatch, module: Projecting) -> dict[str, CheckResult]:
-    monkeypatch.setattr(ProjectionChecks, "wrong_refusals", lambda _: 0.0)  # they call a C function
-    random = np.random.default_rng(0)
-    comparison = Comparison(SYSTEM, StandIn(symbolic.reference_for(SYSTEM)), random, 4)
-    report_projection(comparison, module, "")
-    return {row.name: row for row in comparison.results}
+def rows(module: Projecting) -> dict[str, CheckResult]:
+    comparison = Comparison(SYSTEM, module, np.random.default_rng(0), 4)
+    return {row.name: row for row in comparison.report(projection_checks)}
 
 
 @pytest.mark.slow
-def test_project_is_checked_without_and_with_fixed_coordinates(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_project_is_checked_without_and_with_fixed_coordinates() -> None:
     right = Projecting()
-    results = rows(monkeypatch, right)
+    results = rows(right)
     assert all(row.passed and row.error < 2 for row in results.values())
     assert {len(names) for names in right.fixed_names} == {0, 2}
     for count, fails in ((0, "project"), (2, "project, held")):
-        results = rows(monkeypatch, Projecting((count,)))
+        results = rows(Projecting((count,)))
         assert [name for name, row in results.items() if not row.passed] == [fails]
 
 
-def test_change_of_a_fixed_coordinate_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_change_of_a_fixed_coordinate_fails() -> None:
     class ChangesFixed(Projecting):
         def project(self, q: Any, qd: Any, **how: Any) -> Any:
             result = super().project(q, qd, **how)
             return result * (1 + 4e-16) if how["fixed"] else result
 
-    results = rows(monkeypatch, ChangesFixed())
+    results = rows(ChangesFixed())
     assert [name for name, row in results.items() if not row.passed] == ["project, held"]
     assert np.isinf(results["project, held"].error)

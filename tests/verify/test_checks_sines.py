@@ -10,13 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cases import scene_system
-from conftest import Modules
+from support.cases import scene_system
+from support.session import Modules
+from support.template_checks.runs import VANISHING_LIMIT, largest_error_near_zeros
 
 import eomc
-from eomc.verify.checks_runs import VANISHING_LIMIT, largest_error_near_zeros
-from eomc.verify.comparison import Comparison
-from eomc.verify.report import Measurement
+from eomc.verify.comparison import Comparison, Measurement
 
 
 class ModuleWithChangedD:

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Modules
+from support.session import Modules
 
-from eomc.model.from_scene import from_scene
+from eomc.model.system import from_scene
+from eomc.runtime.package import model_of
 from eomc.scene.read import parse
-from eomc.verify import checks_events
+from eomc.verify import runs
 from eomc.verify.check import check
 from eomc.verify.comparison import Comparison
 
@@ -32,6 +33,7 @@ direction = "falling"
 action = "jump"
 theta_dot = "-0.9*theta_dot"
 [run]
+tolerance = 1e-9
 h = 0.05
 """
 SWING = from_scene(parse(SCENE))
@@ -76,9 +78,10 @@ def perturbed_row(run: Any) -> None:
 
 def check_events(module: Any) -> Any:
     comparison = Comparison(SWING, module, np.random.default_rng(0), 4, None)
-    checks_events.report_fixed_steps(comparison)
-    (result,) = comparison.results
-    assert result.name == "events in steps of rk4" and not module._model.integrator.ignores_events
+    results = comparison.report(runs.event_checks)
+    (result,) = (row for row in results if row.name not in ("events", "jumps"))
+    assert result.name == "events in steps of rk4"
+    assert not model_of(module).integrator.ignores_events
     return result
 
 

@@ -4,34 +4,33 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import constrained
 import numpy as np
 import pytest
 import sympy
-from conftest import tiers
+from support import constraint_cases
+from support.session import tiers
 
-from eomc.base.errors import EomcError
 from eomc.model.system import Constraint, System, symbol, t
 from eomc.verify import kkt, symbolic
 from eomc.verify.reference import ReferenceModel
 from eomc.verify.taylor import TaylorReference
 
-NAMES = list(constrained.cases())
+NAMES = list(constraint_cases.cases())
 SMALL = [n for n in NAMES if n != "iftomm_A02_four_bar_N40"]
 PLANE = [n for n in SMALL if n != "bricard_cube"]
 QUICK = ("pendulum_on_a_winch", "chaplygin_sleigh")
-RUNS = [n for n in SMALL if constrained.cases()[n]["rk4_measured"]]
+RUNS = [n for n in SMALL if constraint_cases.cases()[n]["rk4_measured"]]
 
 
 def answers(name: str) -> list[ReferenceModel]:
-    system = constrained.system(name)
+    system = constraint_cases.system(name)
     return [TaylorReference(system), *([symbolic.derive(system)] if name in SMALL else [])]
 
 
 @pytest.mark.parametrize("name", tiers(NAMES, *PLANE))
 def test_accelerations_and_multipliers_at_reference_states(name: str) -> None:
-    q, qd, a, multipliers = constrained.ends(name, "q_ref", "qd_ref", "qdd_ref", "lambda_ref")
-    t_end = float(constrained.cases()[name]["t_end"])
+    q, qd, a, multipliers = constraint_cases.ends(name, "q_ref", "qd_ref", "qdd_ref", "lambda_ref")
+    t_end = float(constraint_cases.cases()[name]["t_end"])
     for answer in answers(name):
         np.testing.assert_allclose(
             answer.acceleration(q, qd, t_end), a, rtol=0, atol=2e-11 * np.max(np.abs(a))
@@ -48,7 +47,7 @@ def test_both_evaluations_of_constraints_agree(name: str) -> None:
     states.
     """
     taylor, plain = answers(name)
-    q0, qd0 = constrained.ends(name, "q0", "qd0")
+    q0, qd0 = constraint_cases.ends(name, "q0", "qd0")
     random = np.random.default_rng(3)
     q, qd = q0 + random.normal(size=(5, len(q0))) / 5, qd0 + random.normal(size=(5, len(q0)))
     times = random.uniform(0, 3, 5)
@@ -64,8 +63,8 @@ def test_both_evaluations_of_constraints_agree(name: str) -> None:
 @pytest.mark.parametrize("name", tiers(SMALL, *PLANE))
 def test_constraint_rates_are_derivatives(name: str) -> None:
     """Compare A, rates and gamma with differences along a line in time."""
-    answer = TaylorReference(constrained.system(name))
-    q, qd = constrained.ends(name, "q0", "qd0")
+    answer = TaylorReference(constraint_cases.system(name))
+    q, qd = constraint_cases.ends(name, "q0", "qd0")
     q = q + 0.1 * np.cos(np.arange(len(q)))
     qd = qd + np.sin(np.arange(len(q)))
     qdd, h = np.cos(3.0 * np.arange(len(q))), 1e-4
@@ -73,7 +72,7 @@ def test_constraint_rates_are_derivatives(name: str) -> None:
     def value_at(what: str, s: float) -> np.ndarray:
         return answer.evaluate(what, q + s * qd + s**2 * qdd / 2, qd + s * qdd, 0.7 + s)
 
-    n = len(constrained.cases()[name]["constraints"])
+    n = len(constraint_cases.cases()[name]["constraints"])
     A, rates, gamma = (
         answer.evaluate(x, q, qd, 0.7) for x in ("constraint_jacobian", "constraint_rates", "gamma")
     )
@@ -86,14 +85,14 @@ def test_constraint_rates_are_derivatives(name: str) -> None:
 
 @pytest.mark.parametrize("name", tiers(RUNS, "chaplygin_sleigh"))
 def test_error_of_projected_rk4_is_that_of_an_independent_one(name: str) -> None:
-    measured = constrained.cases()[name]["rk4_measured"][0]
-    answer = symbolic.reference_for(constrained.system(name))
+    measured = constraint_cases.cases()[name]["rk4_measured"][0]
+    answer = symbolic.reference_for(constraint_cases.system(name))
     steps = measured["steps"]
     rows = [*range(0, steps, 50), steps]
     times, q, qd = (x[rows] for x in answer.simulate(h=measured["h"], steps=steps))
     expected = measured["projected"]["err_q"]
-    assert constrained.error_of(name, q[-1]) == pytest.approx(expected, rel=0.05)
-    n = len(constrained.cases()[name]["constraints"])
+    assert constraint_cases.error_of(name, q[-1]) == pytest.approx(expected, rel=0.05)
+    n = len(constraint_cases.cases()[name]["constraints"])
     assert np.max(np.abs(answer.evaluate("constraints", q, qd, times)[:, :n]), initial=0) < 1e-13
     rates = answer.evaluate("constraint_rates", q, qd, times)
     assert np.max(np.abs(rates)) < 1e-12 * (1 + np.max(np.abs(qd)))
@@ -145,14 +144,6 @@ def test_failed_projection_is_nan() -> None:
     assert np.all(np.isnan(q))
 
 
-def test_velocity_constraints_must_be_linear() -> None:
-    system = double_pendulum()
-    bad = (Constraint("speed", symbol("x_dot") ** 2 - 1, holonomic=False),)
-    for answer in (symbolic.derive, TaylorReference):
-        with pytest.raises(EomcError, match="speed is not linear in the rates"):
-            answer(replace(system, constraints=bad))
-
-
 def test_scales_make_constraints_and_coordinates_comparable() -> None:
     D, A = np.diag([1e-6, 1e6]), np.array([[1e-3, 1e3], [2.0, 0.0]])
     s = kkt.scales(D, A)
@@ -190,3 +181,12 @@ def test_states_are_corrected_together(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_allclose(corrected, np.moveaxis(single, 0, 1), rtol=1e-15, atol=1e-15)
     assert np.isnan(corrected[0][2]).all() and np.isfinite(np.delete(corrected, 2, 1)).all()
     assert len(calls) - single_calls < 0.8 * single_calls
+
+
+def test_sign_of_mass_matrices_on_constraints() -> None:
+    D = np.diag([-1.0, 1.0])
+    assert not kkt.is_nonnegative(D, np.array([[0.0, 1.0]]))
+    assert kkt.is_nonnegative(D, np.array([[1.0, 0.0]]))
+    assert kkt.is_nonnegative(np.eye(2), np.zeros((0, 2)))
+    for undecided in ([[0.0, 1.0], [0.0, 1.0]], [[0.0, 0.0]], [[0.0, np.nan]]):
+        assert kkt.is_nonnegative(D, np.array(undecided))

@@ -8,16 +8,16 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from conftest import Modules
+from support.session import Modules
+from support.template_checks import check_all
+from support.template_checks.runs import SHORT_LIMIT, RunChecks
 
-from eomc.model.from_scene import from_scene
-from eomc.model.system import System
-from eomc.program.assembly import assembled
+from eomc.mechanism.assembly import assembled
+from eomc.model.system import System, from_scene
 from eomc.scene.read import parse
-from eomc.verify.check import check
-from eomc.verify.checks_constraints import MAX_RESIDUAL, ConstraintChecks
-from eomc.verify.checks_runs import SHORT_LIMIT, RunChecks
 from eomc.verify.comparison import Comparison
+from eomc.verify.constraints import MAX_RESIDUAL, residual_along_run
+from eomc.verify.convergence import Advice, Convergence
 
 CRANK = """
 [[body]]
@@ -83,7 +83,7 @@ def comparison(modules: Modules, *parameters: object, seed: int = 0) -> Comparis
 @pytest.mark.slow
 def test_advised_step_is_tried_from_consistent_states(modules: Modules) -> None:
     """Near the singular position no state near a start moved by 1e-6 satisfies the constraints."""
-    advice = comparison(modules, *TURNS).advice
+    advice = Advice(Convergence(comparison(modules, *TURNS)))
     x, v = -5e-6, -3.6
     advice.stiffest_state = replace(advice.start, q=np.array([x, x, 0]), qd=np.array([v, v, 0]))
     _, grown = advice._ends("rk4", 0.001, 1)
@@ -102,13 +102,11 @@ def test_rounding_amplified_near_singular_positions_is_no_error(
     of: tuple[object, ...], seed: int, modules: Modules
 ) -> None:
     linkage_comparison = comparison(modules, *of, seed=seed)
-    runs, rows = (
-        RunChecks(linkage_comparison),
-        ConstraintChecks(linkage_comparison, linkage_comparison.module),
-    )
+    runs = RunChecks(linkage_comparison)
+    residuals = [residual_along_run("rk4", linkage_comparison, e) for e in runs.starts]
     for error, limit in (
         (runs.short_step_error(), SHORT_LIMIT), (runs.long_step_error(), runs.limit),
-        (rows.residual_along_run("rk4"), MAX_RESIDUAL),
+        *((x, MAX_RESIDUAL) for x in residuals),
     ):  # fmt: skip
         assert isinstance(error, float) and error <= limit
     runs.sine_error()  # advances the random numbers
@@ -121,5 +119,5 @@ def test_rounding_amplified_near_singular_positions_is_no_error(
 def test_check_of_parallelograms_passes(
     of: tuple[object, ...], seed: int, modules: Modules
 ) -> None:
-    report = check(system(*of), modules.unoptimised(parallelogram(*of)), seed=seed)
+    report = check_all(system(*of), modules.unoptimised(parallelogram(*of)), seed=seed)
     assert report.passed, report.table()

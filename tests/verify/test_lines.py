@@ -6,21 +6,9 @@ import re
 from pathlib import Path
 
 import pytest
-from cases import SCENES
-from compilers import compiled, run
-from conftest import needs
-from instrument import check_coverage, unexecuted
-
-# other lines under [run], and the scenes that get them
-VARIANTS = {
-    "dp8": ("cartpole_driven", 'method = ["rk4", "dp8"]'),
-    "batch": ("cartpole", 'batch = true\nmethod = ["rk4", "dp8"]'),
-    "batch of a tree": ("chain", "batch = true"),
-    "float": ("cartpole", 'real = "float"\nbatch = true'),
-    "tolerance": ("cartpole_driven", "tolerance = 1e-9"),
-    "batch by a tolerance": ("cartpole", "batch = true\ntolerance = 1e-9"),
-    "linearize": ("cartpole_driven", 'linearize = "parameters"'),
-}
+from support.cases import RUN_VARIANTS, SCENES, text_of
+from support.compilation import check_coverage, compiled, run, unexecuted
+from support.session import needs
 
 # b has no inertia if a is beyond 2 rad, which a run with b at rest reaches smoothly; z is free, so
 # that it can overflow at the end of a step.
@@ -59,17 +47,15 @@ UNREACHABLE = {
 
 # Lines of adaptive steps that are executed elsewhere: in stiff motion only, as in
 # tests/runtime/test_adaptive_stiff.py; iterations and differences that fail where the accelerations
-# do not; runs without a workspace, which only C programs start.
+# do not; iterations that end by rounding errors, or whose last one changes the error estimate, as
+# in tests/runtime/test_batch_adaptive.py; runs without a workspace, which only C programs start.
 ADAPTIVE = re.compile(
-    r"x->(stiff_votes|stiff) .*|memory->evaluations \+= 2\*NQ \+ 1;|newton = .*|if \(newton\)"
+    r"s->(stiff_votes|newton_steps) .*|\? \w+_NEWTON_STEPS : 0;|a->x\.newton = .*"
+    r"|.*squared_change\(a, b, x->coarse\) < noise\*noise\);|return \w+_NO_CONVERGENCE;"
+    r"|.*last_rough.*|beyond = \w+_select_wide\(again, next, beyond\);"
     r"|continue;|return 1;|return \w+_NOT_FINITE;|row\[k\] = k;|memset\(&own.*|memory = &own;"
-    r"|.*>= memory\[k\]\.max_evaluations;|.*_TOO_LONG;"  # tests/runtime/test_batch_adaptive.py
+    r"|.*>= options->max_evaluations;|.*_TOO_LONG;"  # tests/runtime/test_batch_adaptive.py
 )
-
-
-def text_of(name: str, more: str = "") -> str:
-    text = (SCENES / f"{name}.toml").read_text(encoding="utf-8")
-    return text.replace("[run]\n", f"[run]\n{more}\n")
 
 
 def unexplained(name: str, text: str, folder: Path) -> list[str]:
@@ -87,19 +73,19 @@ def unexplained(name: str, text: str, folder: Path) -> list[str]:
     left = [(n, line) for n, line in left if n not in empty]
     # Steps towards a singular position, and too long for the iteration:
     # tests/runtime/test_adaptive*.py.
-    ends = ("if (!cut && 16*h <=", "fifth*fifth*change >", "if (memory->max_evaluations &&")
+    ends = ("if (!a.ends && 16*a.h <=", "fifth*fifth*change >", "if (options->max_evaluations &&")
     # The projection at a position where the same matrix has been regular before.
-    ends += (f"if (!{name}_least_change(d, D, A, residual, fixed, HOLONOMIC))\n",)
+    ends += (f"if (!{name}_least_change(d, &x, fixed, ROWS))\n",)
     # The projection's iteration diverges and is kept: tests/emit/test_projection.py.
     ends += ("if (part < MIN_PART)",)
     text = source.splitlines(keepends=True)
     refused = {n + 1 for n, x in enumerate(text, 1) if any(e in x for e in ends)}
-    fallback = {n for n, x in enumerate(text, 1) if x.strip() == "at[i] = on[i];"}
+    fallback = {n for n, x in enumerate(text, 1) if x.strip() == "at[i] = start[i];"}
     refused |= fallback | {n - 1 for n in fallback}
     # After the status of a limit of evaluations: tests/runtime/test_batch_adaptive.py.
     refused |= {n + 1 for n in refused if "TOO_LONG" in text[n - 1]}
     left = [(n, line) for n, line in left if n not in refused]
-    if "_adaptive_state;" in source:
+    if "_run_state;" in source:
         left = [(n, line) for n, line in left if not ADAPTIVE.fullmatch(line)]
     if never_singular(name, source):
         left = [(n, line) for n, line in left if n not in after_solve(name, source)]
@@ -117,26 +103,26 @@ def lines_after_constrained_steps(name: str, source: str) -> set[int]:
     numbers: set[int] = set()
     within = judges = rounds = False
     for number, line in enumerate(source.splitlines(), start=1):
-        judges |= bool(
-            re.match(rf"\S.*\b{name}_rate_terms\w*\(|\s+if \(!far && \*singular\)", line)
-        )
+        checks_rates = rf"\S.*\b{name}_(\w*rate_terms\w*|rates_contradict)\("
+        judges |= bool(re.match(rf"{checks_rates}|\s+if \(!more && \*singular\)", line))
         if judges:
             numbers.add(number)
             judges = line not in ("}", " " * 8 + "}")
-        rounds = (rounds or "if (pass && 2*off > before)" in line) and line != " " * 8 + "}"
+        rounds = (rounds or "if (pass && 2*change > last_change)" in line) and line != " " * 8 + "}"
         if rounds:
             numbers.add(number)
         within = (
             within
             or bool(
                 re.match(
-                    rf".*\b{name}_(projected|\w*derivative\w*|stage_slopes|projection_along)\(.*[^;]$",
+                    rf".*\b{name}_(project\w*|\w*derivative\w*|\w*differentiate\w*"
+                    r"|\w*stage_equations)\(.*[^;]$",
                     line,
                 )
             )
         ) and line != "}"
         refuses = within and re.search("return|break", line) and "OK" not in line
-        if refuses or re.match(r"\s+x\.first = \(\w+\)\(first \+ n\)\*h;", line):
+        if refuses or re.match(r"\s+output->first = options->t0 \+ \(\w+\)n\*h;", line):
             numbers.add(number)
     return numbers
 
@@ -165,9 +151,9 @@ def test_every_line_of_every_scene_is_executed(name: str, tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("what", VARIANTS)
+@pytest.mark.parametrize("what", RUN_VARIANTS)
 def test_every_line_of_other_steppers_is_executed(what: str, tmp_path: Path) -> None:
-    name, more = VARIANTS[what]
+    name, more = RUN_VARIANTS[what]
     assert unexplained(name, text_of(name, more), tmp_path) == []
 
 
@@ -198,14 +184,13 @@ def test_gcov_reports_lines_that_were_not_executed(tmp_path: Path) -> None:
 def test_lines_that_were_not_executed_are_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without the compiled checks, lines about refusals are not executed."""
-    import instrument
+    """Without the checks of templates, lines about refusals are not executed."""
+    from support import compilation
 
     needs("gcov")
-    left_out = "check.add_compiled_checks = check.add_property_checks = lambda *_: None"
-    without = f"{left_out}\nreport = check.check"
-    monkeypatch.setattr(
-        instrument, "CHECK", instrument.CHECK.replace("report = check.check", without)
+    own = compilation.CHECK.replace(
+        "support.template_checks import check_all", "eomc.verify.check import check"
     )
+    monkeypatch.setattr(compilation, "CHECK", own.replace("check_all(", "check("))
     left = unexplained("mass_spring", text_of("mass_spring"), tmp_path)
     assert any("MASS_SPRING_SINGULAR" in line for line in left)

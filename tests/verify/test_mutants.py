@@ -1,12 +1,12 @@
-"""The check detects a sample of mutants of the C; `python tests/mutants.py` runs more."""
+"""The check detects a sample of mutants of the C; `python tests/support/mutants.py` runs more."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
-from instrument import in_a_fork
-from mutants import tried
+from support.forks import in_a_fork
+from support.mutants import tried
 
 
 @pytest.mark.slow

@@ -8,16 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trees
-from conftest import tiers
-from instrument import in_a_fork
-from mutants import Bench, Mutant, variant
+from support import trees
+from support.forks import in_a_fork
+from support.mutants import Bench, Mutant, variant
+from support.session import tiers
 
 from eomc.derive import lagrange
 from eomc.derive.ldl import Solution
-from eomc.model.from_scene import from_scene
-from eomc.model.system import System
-from eomc.program.interpret import evaluator, nearby
+from eomc.model.system import System, from_scene
+from eomc.program.ir import evaluator, nearby
 from eomc.program.lower import lower
 from eomc.program.routes import ROUTES, RouteInputs
 from eomc.scene.read import parse

@@ -1,6 +1,6 @@
 """Random valid scenes pass the check, and with one term negated they fail it.
 
-python tests/random_scenes.py --count 2000 [--negate | --wide] runs many more of both.
+python tests/support/random_scenes.py --count 2000 [--negate | --wide] runs many more of both.
 """
 
 from __future__ import annotations
@@ -11,21 +11,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-import scene_author
-from conftest import Modules, tiers
-from random_scenes import JUDGES, outcome
-from scene_author import scene_text
-from scene_author_wide import wide_text
+from support import scene_author
+from support.random_scenes import JUDGES, outcome
+from support.scene_author import scene_text, wide_text
+from support.session import Modules, tiers
+from support.template_checks import check_all
+from support.template_checks.runs import FINE, RunChecks
 
-from eomc.model.from_scene import from_scene
-from eomc.program.assembly import assembled
+from eomc.mechanism.assembly import assembled
+from eomc.model.system import from_scene
 from eomc.scene.read import parse
-from eomc.verify import checks_derivatives
-from eomc.verify.check import check
-from eomc.verify.checks_derivatives import largest_error, module_derivatives
-from eomc.verify.checks_runs import FINE, RunChecks
-from eomc.verify.comparison import Comparison
-from eomc.verify.report import CheckReport, Measurement
+from eomc.verify import equations
+from eomc.verify.comparison import CheckReport, Comparison, Measurement
+from eomc.verify.convergence import Advice, Convergence
+from eomc.verify.equations import module_derivatives
 from eomc.verify.sampling import State
 
 # Correct modules for which a check of orders, advised steps or balances once failed.
@@ -220,7 +219,7 @@ pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
 
 def check_text(text: str, modules: Modules) -> CheckReport:
-    return check(from_scene(parse(text, "test.toml")), modules.unoptimised(text))
+    return check_all(from_scene(parse(text, "test.toml")), modules.unoptimised(text))
 
 
 @cache
@@ -342,15 +341,17 @@ def test_derivatives_are_compared_where_small_terms_matter(
     near = max(abs(float(e.state.q[0])) for e in comparison.expected)
     (far,) = comparison.sampler.far_states()
     assert abs(float(far.state.q[0])) > 2 * near
-    assert largest_error(comparison, "linearize") < 1e-8
+    (row,) = comparison.report(equations.derivative_checks)
+    assert row.name == "linearize" and row.error < 1e-8
 
     def wrong(check: Comparison, name: str, s: State) -> Any:
         derivatives = module_derivatives(check, name, s)
         assert derivatives is not None
         return derivatives + 1e-3 * (s.q[0] / 0.3) ** 6
 
-    monkeypatch.setattr(checks_derivatives, "module_derivatives", wrong)
-    assert largest_error(comparison, "linearize") > 1e-7
+    monkeypatch.setattr(equations, "module_derivatives", wrong)
+    (row,) = comparison.report(equations.derivative_checks)
+    assert row.error > 1e-7
 
 
 WOUND_ARM = """eomc = 1
@@ -447,8 +448,9 @@ def test_unstable_steps_do_not_determine_the_scale_of_the_motion(modules: Module
     assert comparison.simulate(comparison.sampler.start).status == "not finite"
     assert np.allclose(comparison.sampler.spread, [0.5, 0.3], rtol=0.1)
     assert np.allclose(comparison.sampler.speed, [84, 3], rtol=0.1)
-    stiff = comparison.advice.stiffest_state
-    assert np.all(np.abs([stiff.q, stiff.qd]) < 101 * comparison.advice.scale)
+    advice = Advice(Convergence(comparison))
+    stiff = advice.stiffest_state
+    assert np.all(np.abs([stiff.q, stiff.qd]) < 101 * advice.scale)
     report = report_of(LEAVING, modules)
     (row,) = (r for r in report.results if r.name == "h of gauss16")
     assert row.judged and report.passed, report.table()

@@ -107,7 +107,7 @@ class Problem:
         shown = _printable(self.source[start : start + most])
         before = "…" if start else ""
         after = "…" if len(self.source) > start + most else ""
-        gutter = f"  {self.line} | "
+        gutter = f"  {self.line} | " if self.line else "  | "
         text += f"\n{gutter}{before}{shown}{after}"
         if self.column >= 0:
             left = len(before) + self.column - start

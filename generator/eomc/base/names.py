@@ -5,6 +5,7 @@ from __future__ import annotations
 import keyword
 import re
 import sys
+from hashlib import sha256
 
 MAX_LENGTH = 40
 
@@ -62,8 +63,8 @@ GREEK = {
 def plain(name: str) -> str:
     """Convert a name, such as a Greek letter or LaTeX text, to a valid C identifier; return it.
 
-    Greek letters are written out, LaTeX syntax is removed, and "_1" is appended to reserved names,
-    such as keywords and functions of C.
+    Greek letters are written out, LaTeX syntax is removed, "_1" is appended to reserved names, such
+    as keywords and functions of C, and the end of a long name is replaced by a hash.
 
     >>> plain("θ₁"), plain(r"\\theta_{1}"), plain("lambda")
     ('theta_1', 'theta_1', 'lambda_1')
@@ -75,6 +76,8 @@ def plain(name: str) -> str:
     text = re.sub(r"_+", "_", text).strip("_")
     if not text or not text[0].isalpha():
         text = "v_" + text if text else "v"
+    if len(text) > MAX_LENGTH:
+        text = f"{text[: MAX_LENGTH - 9].rstrip('_')}_{sha256(text.encode()).hexdigest()[:8]}"
     return text + "_1" if text in _WHY else text
 
 

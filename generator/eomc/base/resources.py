@@ -57,7 +57,7 @@ def parts() -> Iterator[tuple[str, Path]]:
     for kind, root, suffix in (
         ("eomc", PACKAGE, ".py"),
         ("templates", folder("templates"), ".jinja"),
-        ("csrc", folder("csrc"), ".h"),
+        ("csrc", folder("csrc"), ".[ch]"),
     ):
         for file in sorted(root.rglob("*" + suffix)):
             yield f"{kind}/{file.relative_to(root).as_posix()}", file

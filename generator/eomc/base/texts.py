@@ -14,9 +14,9 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NoReturn
+from typing import Any, NoReturn
 
 # control characters, marks of writing direction, separators of lines, halves of characters,
 # and the two that no file of text may hold
@@ -120,14 +120,18 @@ def comment(text: str) -> str:
     return re.sub(r"\*(?=/)|/(?=\*)", r"\g<0> ", text)
 
 
-def python(value: str | Mapping[str, str]) -> str:
-    """Return Python source code of a literal whose value is the given string or dict of strings.
+def python(value: Any) -> str:
+    """Return Python source code of a literal whose value is the given string, number or container.
 
-    Raises TypeError for values of other types.
+    Containers are dicts, lists and tuples. Raises TypeError for values of other types.
     """
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{python(k)}: {python(v)}" for k, v in value.items()) + "}"
-    return str.__repr__(value)
+    if isinstance(value, list):
+        return "[" + ", ".join(map(python, value)) + "]"
+    if isinstance(value, tuple):
+        return "(" + ", ".join(map(python, value)) + ("," if len(value) == 1 else "") + ")"
+    return repr(value) if isinstance(value, bool | int | float) else str.__repr__(value)
 
 
 def docstring(text: str) -> str:
@@ -155,9 +159,21 @@ def xml(text: str) -> str:
     return str(escape(line(text)))
 
 
-def toml(text: str) -> str:
-    """Return `text` as one line in quotes, a TOML string."""
-    return json.dumps(line(text), ensure_ascii=False)
+def toml(value: Any) -> str:
+    """Return a string, a number, or a dict or sequence of these as a TOML value in one line.
+
+    Of a number, it is the shortest text that reads back as the number.
+    """
+    if isinstance(value, str):
+        return json.dumps(line(value), ensure_ascii=False)
+    if isinstance(value, Mapping):
+        return f"{{ {', '.join(f'{key} = {toml(entry)}' for key, entry in value.items())} }}"
+    if isinstance(value, Sequence):
+        return f"[{', '.join(map(toml, value))}]"
+    if isinstance(value, bool | int):
+        return str(value).lower()
+    short = repr(float(value)).removesuffix(".0")
+    return "0" if short == "-0" else short
 
 
 def figure(text: str) -> str:
@@ -185,14 +201,14 @@ def command(file: str) -> str:
 
 @dataclass(frozen=True)
 class FreeText:
-    """Free text for a Jinja template: a string that a user wrote, or a dict of such strings.
+    """Free text for a Jinja template: a string that a user wrote, or a container of such strings.
 
     The text must be escaped for the language that surrounds it. A template therefore prints one of
     the properties, such as `{{ title.comment }}` in a C comment. Printing the object itself raises
     TypeError.
     """
 
-    text: str | Mapping[str, str]
+    text: Any
 
     def __bool__(self) -> bool:
         return bool(self.text)
@@ -223,7 +239,7 @@ class FreeText:
 
     @property
     def python(self) -> str:
-        """The text, or the dict of texts, as the source text of a Python literal."""
+        """The text, or the container of texts, as the source text of a Python literal."""
         return python(self.text)
 
     def _single_text(self) -> str:

@@ -28,7 +28,7 @@ def dof_command(scene: Path, as_json: bool) -> None:
     eomc dof scenes/arm.toml
     eomc dof scenes/slider_crank.toml
     """
-    from eomc.model import mobility
+    from eomc.mechanism import mobility
     from eomc.scene import read as scenes
 
     checked_scene = scenes.read(scene)
@@ -39,7 +39,7 @@ def dof_command(scene: Path, as_json: bool) -> None:
         counted, lines = mobility_count.as_dict(), [mobility_count.table()]
     if checked_scene.constrained:
         from eomc import pipeline
-        from eomc.program import ranks
+        from eomc.mechanism import ranks
 
         system = pipeline.read(scene)
         assert system.closure is not None

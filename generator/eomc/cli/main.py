@@ -1,7 +1,7 @@
-"""The command: eomc new, import, build, check, run, report, show, export, dof, list.
+"""The command: eomc new, import, build, check, run, sweep, report, show, export, dof, list.
 
 Exit status: 0 for success, 1 if a check failed or a run could not continue, 2 for bad input. A
-command's module is imported when the command is called, and slow imports (SymPy, pydantic, rich)
+command's module is imported when the command is called, and slow imports (SymPy, rich)
 are made where they are needed: `eomc build` with nothing to do takes a tenth of a second.
 """
 
@@ -21,9 +21,9 @@ from eomc.cli.terminal import fail, say
 
 # name of each command, and the module with the function <name>_command
 COMMANDS = {
-    "build": "build", "check": "check", "dof": "description", "export": "build",
-    "import": "scenes", "list": "scenes", "new": "scenes", "report": "report", "run": "run",
-    "show": "description",
+    "build": "build", "check": "comparison", "dof": "description", "export": "build",
+    "import": "scenes", "list": "scenes", "new": "scenes", "report": "comparison", "run": "run",
+    "show": "description", "sweep": "sweep",
 }  # fmt: skip
 
 

@@ -26,7 +26,7 @@ from eomc.runtime.package import model_of
 if TYPE_CHECKING:
     from eomc.runtime.balance import Balance
     from eomc.runtime.estimate import Estimate
-    from eomc.runtime.trajectory import Run
+    from eomc.runtime.trajectory import Trajectory
 
 
 # hints for options of other programs
@@ -87,7 +87,7 @@ class Simulation:
     beyond_duration: remark if the step size is longer than the duration; else None.
     """
 
-    run: Run
+    run: Trajectory
     seconds: float
     beyond_stability: str | None
     beyond_duration: str | None
@@ -164,11 +164,11 @@ def run_command(arguments: RunArguments) -> None:
     has_work = model_of(module).functions.has_power or len(run.events) > 0  # forces, or jumps
     balance = run.balance() if has_work and simulation.is_short else None
     if plot:
-        from eomc.report.plot import RunCurves, write_figure
+        from eomc.report.plot import write_figure
 
-        curves = RunCurves.from_run(run, balance.words if balance else "")
         system = pipeline.read(scene).with_parameters(parameters)
-        write_figure(system, curves, plot, wrap=arguments.wrap)
+        words = balance.words if balance else ""
+        write_figure(system, run, plot, wrap=arguments.wrap, balance=words)
     if animate:
         with status_line(f"drawing {animate.name}", silent):
             run.animate(animate)
@@ -329,7 +329,7 @@ def _change(energy: Any) -> float | None:
     return float(np.max(np.abs(energy - energy[0]))) if np.isfinite(energy).all() else None
 
 
-def _error(run: Run) -> dict[str, Any] | None:
+def _error(run: Trajectory) -> dict[str, Any] | None:
     """Return the error estimate of a run for JSON, without inf and nan."""
     error = run.error
     if error is None:
@@ -376,7 +376,7 @@ def _summary(
             "balance": asdict(balance) if balance else None,
         },
         "events": {name: e.t.tolist() for name, e in run.events.items()},
-        "stopped_by": getattr(run, "stopped", "") or None,
+        "stopped_by": run.stopped or None,
         "saturated": _saturation(module, run),
         "jacobi_change": None if np.array_equal(energy, jacobi) else _change(jacobi),
         "error_estimate": _error(run),
@@ -389,14 +389,14 @@ def _summary(
     }
 
 
-def _saturation(module: Any, run: Run) -> dict[str, float]:
+def _saturation(module: Any, run: Trajectory) -> dict[str, float]:
     """Return the fraction of rows in which each input was beyond its limits, if there are any."""
     parts = zip(module.inputs, map(float, run.saturated.mean(axis=0)), strict=True)
     return {name: part for name, part in parts if part}
 
 
 def _print_summary(
-    module: Any, run: Run, balance: Balance | None, summary: Mapping[str, Any]
+    module: Any, run: Trajectory, balance: Balance | None, summary: Mapping[str, Any]
 ) -> None:
     say(
         f"{escape_line(module.title)}: {run.steps} steps of {summary['method']}, "
@@ -431,7 +431,7 @@ def _print_summary(
         say(f"  wrote {escape_line(file)}")
 
 
-def _print_energy(run: Run, balance: Balance | None, summary: Mapping[str, Any]) -> None:
+def _print_energy(run: Trajectory, balance: Balance | None, summary: Mapping[str, Any]) -> None:
     """Print the conserved quantity or the energy balance, and K + P if it differs."""
     energy, jacobi = summary["energy"], summary["jacobi_change"]
     if energy["largest_change"] is None:
@@ -446,13 +446,13 @@ def _print_energy(run: Run, balance: Balance | None, summary: Mapping[str, Any])
     say(f"  {name} {end:.9g} J{how}")
 
 
-def _print_error(module: Any, error: Estimate, run: Run) -> None:
+def _print_error(module: Any, error: Estimate, run: Trajectory) -> None:
     import math
 
     q, qd = float(error.q[-1].max()), float(error.qd[-1].max())
     observed = "only rounding seen" if math.isnan(error.observed) else f"seen: {error.observed:.1f}"
     how = f"in shorter steps; order {error.order}, {observed}"
-    if hasattr(run, "tol"):
+    if not run.request.has_equal_steps:
         how = "with a hundredth of the tolerance" if run.tol else "in steps a quarter as long"
     size = f"about {q:.1g} in q, {qd:.1g} in qd" if max(q, qd) < math.inf else "unknown"
     say(f"  error at the end {size} (from the same run {how})")

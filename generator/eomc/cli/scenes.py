@@ -14,7 +14,7 @@ import click
 from eomc import pipeline
 from eomc.base import resources, texts
 from eomc.base.errors import EomcError, NoCompilerError
-from eomc.cli import files, options
+from eomc.cli import options
 from eomc.cli.options import parse_pairs
 from eomc.cli.terminal import escape_line, say
 
@@ -49,14 +49,14 @@ def new_command(name: str | None, source: str | None) -> None:
     copied = None if source is None else _copy_shipped(source, name)
     if why := names.module_fault(name):
         raise EomcError(why)
-    path = files.scene_path(name)
-    files.write_new(path, _driven_pendulum(name) if copied is None else copied)
+    path = options.scene_path(name)
+    options.write_new(path, _driven_pendulum(name) if copied is None else copied)
     say(f"wrote {escape_line(path)}; try: eomc run {texts.command(str(path))}")
 
 
 def _driven_pendulum(name: str) -> str:
     """Return the driven pendulum under this name."""
-    from eomc.emit.render import environment
+    from eomc.emit.common.templates import environment
 
     title = name.replace("_", " ").capitalize()
     return environment().get_template("scene/scene.toml.jinja").render(name=name, title=title)
@@ -137,14 +137,14 @@ def import_command(arguments: ImportArguments) -> None:
     from eomc.scene.toml_text import MAX_BYTES
 
     robot = _edit_robot(_read_robot(arguments), arguments)
-    path = arguments.out or files.scene_path(robot.name)
+    path = arguments.out or options.scene_path(robot.name)
     text = scene_text.scene_text(robot)
     if len(text.encode()) > MAX_BYTES:
         raise EomcError(
             f"{escape_line(arguments.file)}: its scene would have {len(text.encode())} bytes, and "
             f"a scene has at most {MAX_BYTES}: cut out a part with --root and --tip"
         )
-    files.write_new(path, text)
+    options.write_new(path, text)
     called = "" if path.stem == robot.name else f"; its module is called {robot.name}"
     points = sum(body.point for body in robot.bodies)
     marks = f"points {points}, " if points else ""
@@ -163,12 +163,11 @@ def import_command(arguments: ImportArguments) -> None:
 def _read_robot(arguments: ImportArguments) -> Robot:
     """Read the robot file, and give the robot the requested name."""
     from eomc.base import names
-    from eomc.robots import urdf, xml
-    from eomc.robots.mjcf import read
+    from eomc.robots import mjcf, urdf, xml
 
     file, name = arguments.file, arguments.name
     if xml.root(file).kind.startswith("mujoco"):  # mujocoinclude is a part, which is refused
-        robot = read.read(file, arguments.include)
+        robot = mjcf.read(file, arguments.include)
     elif arguments.include:
         raise EomcError(f"--include is for MJCF files, and {escape_line(file)} is none")
     else:
@@ -182,8 +181,7 @@ def _read_robot(arguments: ImportArguments) -> Robot:
 
 def _edit_robot(robot: Robot, arguments: ImportArguments) -> Robot:
     """Return the robot, prepared for a scene, with the changes that the options request."""
-    from eomc.robots import edit, preparation
-    from eomc.robots.limits import with_input_limits
+    from eomc.robots import edit, scene_text
     from eomc.robots.robot import with_left_out_note
 
     locked_values = dict(parse_pairs(arguments.locks, "--lock", {}))
@@ -199,10 +197,10 @@ def _edit_robot(robot: Robot, arguments: ImportArguments) -> Robot:
         if arguments.stops:
             robot = edit.with_joint_stops(robot)
         if arguments.limits:
-            robot = with_input_limits(robot)
+            robot = edit.with_input_limits(robot)
         if arguments.parameters:
             robot = edit.with_masses(robot, arguments.tip)
-        return preparation.prepare_for_scene(robot)
+        return scene_text.prepare_for_scene(robot)
     except EomcError as fault:
         raise with_left_out_note(fault, robot.left_out) from None
 
@@ -258,7 +256,7 @@ def _row(path: Path, root: Path) -> Row | None:
 
     try:
         text, _ = tree_and_digest(path)
-    except (OSError, ValueError):
+    except (OSError, EomcError):
         text = {"eomc": 0, "name": path.stem, "title": "(can't be read: eomc build says why)"}
     if "eomc" not in text or not isinstance(text.get("name"), str):
         return None

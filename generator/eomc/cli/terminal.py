@@ -78,21 +78,20 @@ def _is_interactive(silent: bool) -> bool:
 
 
 @contextmanager
-def progress_bar(
-    what: str, silent: bool, after: float = 1.0
-) -> Iterator[Callable[[int, int], None]]:
+def progress_bar(what: str, silent: bool, after: float = 1.0) -> Iterator[Callable[..., None]]:
     """Show a progress bar while the block of the with statement runs, if stderr is a terminal.
 
-    The block receives a function, which it calls as update(completed, total). what: text in front
-    of the bar. silent: True to show no bar. after: time in s after which the bar appears.
+    The block receives a function, which it calls as update(completed, total) or, with another text
+    in front of the bar, update(completed, total, text). what: text in front of the bar. silent:
+    True to show no bar. after: time in s after which the bar appears.
     """
     if not _is_interactive(silent):
-        yield lambda completed, total: None
+        yield lambda completed, total, text="": None
         return
     started_at = time.monotonic()
     bar: list[Any] = []
 
-    def update(completed: int, total: int) -> None:
+    def update(completed: int, total: int, text: str = what) -> None:
         if not bar and time.monotonic() - started_at >= after and completed < total:
             from rich.console import Console
             from rich.progress import Progress, TextColumn
@@ -103,7 +102,7 @@ def progress_bar(
             progress.start()
             bar.extend([progress, progress.add_task(escape_line(what), total=total)])
         if bar:
-            bar[0].update(bar[1], completed=completed)
+            bar[0].update(bar[1], completed=completed, description=escape_line(text))
 
     try:
         yield update

@@ -15,10 +15,9 @@ from itertools import combinations_with_replacement
 
 from sympy import Expr, S
 
-from eomc.derive.links import AXES, ZERO, Vector
-from eomc.derive.newton_euler import Inertia, TreeDynamics
+from eomc.derive.newton_euler import AXES, ZERO, Inertia, TreeDynamics, Vector
 from eomc.derive.tape import Stage
-from eomc.model.rational import Matrix
+from eomc.model.tree import Matrix
 
 Rows = list[list[Expr]]
 Column = tuple[Sequence[Expr], Sequence[Expr]]  # U = I s of a joint axis s: moment, force
@@ -91,19 +90,19 @@ class _Articulated:
         joint_force: list[Expr] = [S.Zero] * n
         for k in reversed(range(n)):
             link, body, a = self.links[k], bodies[k], self.links[k].axis
-            if link.turns:
-                u_m, u_f = body.J[a], body.H[a]
-            else:
-                u_m, u_f = [row[a] for row in body.H], body.M[a]
-            along_axis = (u_m if link.turns else u_f)[a]
-            d = V.add(along_axis, r.armature[k])
+            columns_of_inertia = (body.J[a], [row[a] for row in body.H]), (body.H[a], body.M[a])
+            u_m, u_f = (
+                V.plus(V.scaled(by_turn, tree.angular[k]), V.scaled(by_slide, tree.linear[k]))
+                for by_turn, by_slide in columns_of_inertia
+            )
+            d = V.add(tree.along_joint(k, u_f, u_m), r.armature[k])
             if d == 0:
                 raise MasslessError(k)
             is_constant = V.tape.stage_of(d) <= Stage.PARAMETER
             pivots.append((d, d if is_constant else V.add(d, size[k])))
             inverse[k] = V.define(1 / d)
             columns[k] = (u_m, u_f)
-            joint_force[k] = V.add(drive[k], V.minus((m if link.turns else f)[k][a]))
+            joint_force[k] = V.add(drive[k], V.minus(tree.along_joint(k, f[k], m[k])))
             if link.parent < 0:
                 continue
             reduced = self._without_joint_motion(k, body, columns[k], inverse[k])
@@ -139,9 +138,8 @@ class _Articulated:
             )
             qdd = V.times(remaining, inverse[k])
             out.append(qdd)
-            relative = tree.on_axis(k, qdd)
-            alphas.append(V.plus(alpha, relative) if link.turns else alpha)
-            origins.append(acceleration if link.turns else V.plus(acceleration, relative))
+            alphas.append(V.plus(alpha, tree.turn(k, qdd)))
+            origins.append(V.plus(acceleration, tree.slide(k, qdd)))
         return out
 
     def _unreduced_size(self, k: int, body: _Inertia) -> Expr:
@@ -152,16 +150,16 @@ class _Articulated:
         V, tree = self.vectors, self.tree
         p = self.links[k].parent
         parent = self.links[p]
-        along_axis = parent.inertia[parent.axis] if parent.turns else parent.mass
-        if along_axis != 0 or self.dynamics.armature[p] != 0:
+        along_axis = parent.angular * parent.inertia[parent.axis], parent.linear * parent.mass
+        if any(x != 0 for x in along_axis) or self.dynamics.armature[p] != 0:
             return S.Zero
         mass = [body.M[i][i] for i in range(3)]
-        if not parent.turns:
-            return V.add(*mass)
+        size = V.times(V.times(tree.linear[p], tree.linear[p]), V.add(*mass))
+        if tree.angular[p] == 0:
+            return size
         distance_squared = V.dot(tree.arm[k], tree.arm[k])
-        return V.add(
-            *(body.J[i][i] for i in range(3)), *(V.times(distance_squared, m) for m in mass)
-        )
+        turned = (V.times(distance_squared, m) for m in mass)
+        return V.add(size, *(body.J[i][i] for i in range(3)), *turned)
 
     def _rigid_body_inertia(self, x: Inertia) -> _Inertia:
         """Return the articulated inertia of a single rigid body."""
@@ -175,7 +173,10 @@ class _Articulated:
     def _without_joint_motion(
         self, k: int, body: _Inertia, column: Column, inverse: Expr
     ) -> _Inertia:
-        """Return I - U U^T/d. Without armature, the entries along the joint are exactly zero."""
+        """Return I - U U^T/d. Without armature, (I - U U^T/d) S is exactly zero.
+
+        For a rotation or a translation, these are entries of the result.
+        """
         V = self.vectors
         link = self.links[k]
         u_m, u_f = column
@@ -190,9 +191,9 @@ class _Articulated:
         if self.dynamics.armature[k] == 0:
             a = link.axis
             for i in range(3):
-                if link.turns:
+                if link.linear == 0:
                     J[a][i] = J[i][a] = H[a][i] = S.Zero
-                else:
+                elif link.angular == 0:
                     M[a][i] = M[i][a] = H[i][a] = S.Zero
         return _Inertia(J, H, M)
 
@@ -219,7 +220,7 @@ class _Articulated:
     def _to_parent_frame(self, k: int, x: _Inertia) -> _Inertia:
         """Transform an inertia from link k's frame to its parent's frame and origin."""
         V, tree = self.vectors, self.tree
-        if self.links[k].turns:
+        if tree.angular[k] != 0:
             x = _Inertia(*(self._rotate_by_joint(k, m) for m in (x.J, x.H, x.M)))
         R = tree.rotation[k]
         if not all(R[i][j] == (i == j) for i in range(3) for j in range(3)):

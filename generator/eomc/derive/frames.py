@@ -21,7 +21,7 @@ from sympy import Expr, S, Symbol
 from eomc.base.errors import SceneError
 from eomc.base.spatial import ENTRIES
 from eomc.derive.energies import leaves
-from eomc.derive.links import AXES, ZERO, LinkFrames, Vector
+from eomc.derive.newton_euler import AXES, ZERO, LinkFrames, Vector
 from eomc.derive.tape import Stage, Tape
 from eomc.model.symbols import needed_definitions, symbol
 from eomc.model.system import System, t
@@ -192,7 +192,7 @@ class TreeKinematics:
         if p >= 0:
             columns = [self.world(p, column) for column in columns]
             step = self.world(p, step)
-        if link.turns:
+        if tree.angular[k] != 0:
             c, s = tree.cosine[k], tree.sine[k]
             i, j = AXES[link.axis]
             x, y = columns[i], columns[j]
@@ -205,20 +205,20 @@ class TreeKinematics:
     def _append_motion(self, k: int, p: int) -> None:
         """Append velocity and acceleration of link k, from those of its parent p."""
         V, tree = self.vectors, self.tree
-        link, axis, r = self.links[k], self.axis(k), self.step[k]
-        relative = V.scaled(axis, tree.speed[k])
-        relative_acceleration = V.scaled(axis, V.add(self.joint_accelerations[k], tree.drift[k]))
+        axis, r = self.axis(k), self.step[k]
+        rate, acceleration = tree.speed[k], V.add(self.joint_accelerations[k], tree.drift[k])
+        turn, slide = (
+            (V.scaled(axis, V.times(x, rate)), V.scaled(axis, V.times(x, acceleration)))
+            for x in (tree.angular[k], tree.linear[k])
+        )
         v = a = omega = alpha = ZERO
         if p >= 0:
             omega, alpha = self.spin[p], self.turning[p]
             v, a = self.propagate((self.velocity[p], omega), (self.acceleration[p], alpha), r)
-        coriolis = V.cross(omega, relative)
-        if link.turns:
-            alpha = V.plus(alpha, relative_acceleration, coriolis)
-            omega = V.plus(omega, relative)
-        else:
-            v = V.plus(v, relative)
-            a = V.plus(a, relative_acceleration, V.scaled(coriolis, S(2)))
+        v = V.plus(v, slide[0])
+        a = V.plus(a, slide[1], V.scaled(V.cross(omega, slide[0]), S(2)))
+        alpha = V.plus(alpha, turn[1], V.cross(omega, turn[0]))
+        omega = V.plus(omega, turn[0])
         self.spin.append(omega)
         self.turning.append(alpha)
         self.velocity.append(v)
@@ -322,7 +322,8 @@ class TreeKinematics:
         lever = arm
         while k >= 0:
             link, axis = self.links[k], self.axis(k)
-            twist = (V.cross(axis, lever), axis) if link.turns else (axis, ZERO)
+            turn, slide = (V.scaled(axis, x[k]) for x in (self.tree.angular, self.tree.linear))
+            twist = V.plus(V.cross(turn, lever), slide), turn
             for q, derivative in self.tree.slopes[k].items():
                 linear, angular = (V.scaled(x, derivative) for x in twist)
                 jacobian[q] = (
@@ -381,7 +382,10 @@ class TreeKinematics:
         joint_forces = [S.Zero] * self.n
         for k in reversed(range(self.n)):
             link = self.links[k]
-            joint_forces[k] = V.dot(self.axis(k), (moment if link.turns else force)[k])
+            turn, slide = (
+                V.scaled(self.axis(k), x[k]) for x in (self.tree.angular, self.tree.linear)
+            )
+            joint_forces[k] = V.add(V.dot(turn, moment[k]), V.dot(slide, force[k]))
             if (p := link.parent) >= 0:
                 force[p] = V.plus(force[p], force[k])
                 moment[p] = V.plus(moment[p], moment[k], V.cross(self.step[k], force[k]))

@@ -28,7 +28,7 @@ from sympy.polys.matrices.exceptions import DMNonInvertibleMatrixError
 
 from eomc.derive.energies import Energies, energies_on_tape
 from eomc.derive.ldl import Pairs, Solution, Vector, solve
-from eomc.derive.links import Vectors
+from eomc.derive.newton_euler import Vectors
 from eomc.derive.tape import Stage, is_negative, split
 from eomc.model.system import System, dot, t
 

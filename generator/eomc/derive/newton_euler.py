@@ -1,4 +1,4 @@
-"""Recursive Newton-Euler and composite-body algorithms on a tape, in the links' own frames.
+"""Recursive Newton-Euler and composite-body algorithms on a tape, in the frames of the links.
 
 Zeros and numbers that are known at generation time vanish on the tape, so the plane, parallel axes
 and massless links need no code of their own. With all qdd = 0, one outward pass computes the
@@ -14,17 +14,244 @@ Robots*, ch. 9 (the matrix U, the grouping of inertial parameters).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 
-from sympy import Expr, S
+import sympy
+from sympy import Expr, S, Symbol
 
-from eomc.base.spatial import ENTRIES
-from eomc.derive.links import AXES, ZERO, LinkFrames, Vector
+from eomc.base.spatial import ENTRIES, transposed
 from eomc.derive.tape import Tape
-from eomc.model.rational import Matrix
-from eomc.model.tree import Link, Tree
+from eomc.model.tree import Link, Matrix, Tree
+
+Vector = tuple[Expr, Expr, Expr]
+
+ZERO: Vector = (S.Zero, S.Zero, S.Zero)
+AXES = ((1, 2), (2, 0), (0, 1))  # for each axis, the other two in cyclic order
+
+
+class Vectors:
+    """Sums and products of numbers and vectors on a tape; terms that are zero are left out.
+
+    A tape is a list of elementary operations, each with a named result. The arguments and results
+    of the methods are atoms of the tape: numbers, names, or numbers times a name.
+    """
+
+    def __init__(self, tape: Tape) -> None:
+        self.tape = tape
+
+    def define(self, e: Expr) -> Expr:
+        """Add an expression to the tape and return it as a number, a name, or a number times it."""
+        return self.tape.define(e)
+
+    def add(self, *terms: Expr) -> Expr:
+        """Return the sum of the terms, 0 without terms."""
+        return self.tape.total([x for x in terms if x is not S.Zero])
+
+    def times(self, a: Expr, b: Expr) -> Expr:
+        """Return the product a b of two atoms."""
+        return S.Zero if a is S.Zero or b is S.Zero else self.tape.times(a, b)
+
+    def minus(self, a: Expr) -> Expr:
+        """Return -a, the negative of an atom."""
+        return self.tape.scaled(S.NegativeOne, a)
+
+    def vector(self, v: Sequence[Expr]) -> Vector:
+        """Return the vector whose entries are the atoms of the three expressions v."""
+        x, y, z = map(self.define, v)
+        return (x, y, z)
+
+    def plus(self, *vectors: Sequence[Expr]) -> Vector:
+        """Return the sum of vectors, entry by entry."""
+        x, y, z = (self.add(*parts) for parts in zip(*vectors, strict=True))
+        return (x, y, z)
+
+    def dot(self, a: Sequence[Expr], b: Sequence[Expr]) -> Expr:
+        """Return the scalar product a . b."""
+        return self.add(*(self.times(x, y) for x, y in zip(a, b, strict=True)))
+
+    def cross(self, a: Sequence[Expr], b: Sequence[Expr]) -> Vector:
+        """Return the vector product a x b."""
+        x, y, z = (
+            self.add(self.times(a[i], b[j]), self.minus(self.times(a[j], b[i]))) for i, j in AXES
+        )
+        return (x, y, z)
+
+    def apply(self, R: Sequence[Sequence[Expr]], v: Sequence[Expr]) -> Vector:
+        """Return the product R v of a 3 x 3 matrix, given by rows, and a vector."""
+        x, y, z = (self.dot(row, v) for row in R)
+        return (x, y, z)
+
+    def scaled(self, v: Sequence[Expr], x: Expr) -> Vector:
+        """Return the product x v of a vector and an atom."""
+        a, b, c = (self.times(e, x) for e in v)
+        return (a, b, c)
+
+
+class LinkFrames:
+    """Frames of the links of a kinematic tree, parents before children, as symbolic expressions.
+
+    Expressions are defined on a tape, a list of elementary operations with named results. Link k
+    moves relative to its parent by the displacement s_k(q) of its joint: it turns about the joint's
+    axis by `links[k].angular` s_k (rad), and slides along it by `links[k].linear` s_k (m).
+
+    Attributes
+    ----------
+    vectors : Vectors
+        Sums and products on the tape.
+    displacement, speed, drift
+        For each link, s_k, its time derivative, and its second time derivative at qdd = 0.
+    slopes
+        For each link, the derivatives ds_k/dq by coordinate.
+    angular, linear
+        For each link, the motion subspace (angular e, linear e) with the unit vector e of the axis.
+    cosine, sine
+        For each link, the cosine and sine of the joint's angle; 1 and 0 for a prismatic joint.
+    rotation
+        For each link, the rotation matrix from its frame at s_k = 0 to its parent's frame.
+    arm
+        For each link, the vector from the parent's origin to its own, in the parent's frame.
+    """
+
+    def __init__(self, tape: Tape, tree: Tree) -> None:
+        V = self.vectors = Vectors(tape)
+        self.links = tree.links
+        self.n = len(tree.links)
+        # joint displacement s_k(q), its rate, its second derivative at qdd = 0, and ds_k/dq
+        rates = dict(tree.rates)
+        self.displacement = [V.define(x.q) for x in self.links]
+        self.speed = tape.forward(self.displacement, rates)
+        self.drift = tape.forward(self.speed, rates)
+        self.slopes = [
+            {q: tape.forward([moved], {q: S.One})[0] for q in rates if q in x.q.free_symbols}
+            for x, moved in zip(self.links, self.displacement, strict=True)
+        ]
+        pairs = [*zip(self.links, self.displacement, strict=True)]
+        self.angular = [x.angular for x in self.links]
+        self.linear = [V.define(x.linear) for x in self.links]
+        self.cosine = [V.define(sympy.cos(x.angular * s)) for x, s in pairs]
+        self.sine = [V.define(sympy.sin(x.angular * s)) for x, s in pairs]
+        self.rotation: list[Matrix] = [
+            tuple(V.vector(row) for row in x.rotation)  # type: ignore[misc]
+            for x in self.links
+        ]
+        self.arm = [self._arm(k) for k in range(self.n)]
+
+    # --- joints and coordinates ------------------------------------------------------------------
+
+    @property
+    def has_own_coordinates(self) -> bool:
+        """Whether each joint has a coordinate of its own: s_k = q_k."""
+        coordinates = {link.q for link in self.links if link.q.is_Symbol}
+        return len(coordinates) == self.n
+
+    def project_forces(self, by_link: Iterable[Expr]) -> dict[Symbol, Expr]:
+        """Return the generalized force on each coordinate, from the force along each joint.
+
+        `by_link` contains the force f_k (N) or moment (N m) along the joint of each link k. With
+        the joint's displacement s_k, the generalized force on q is sum_k ds_k/dq f_k.
+        """
+        V = self.vectors
+        terms: dict[Symbol, list[Expr]] = {}
+        for slopes, force in zip(self.slopes, by_link, strict=True):
+            for q, slope in slopes.items():
+                terms.setdefault(q, []).append(V.times(slope, force))
+        return {q: V.add(*forces) for q, forces in terms.items()}
+
+    def joint_rates(self, direction: Mapping[Symbol, Expr]) -> list[Expr]:
+        """Return the rate of each joint's displacement, from the rate of each coordinate.
+
+        `direction` maps each coordinate q to its rate v_q. With the displacement s_k of the joint
+        of link k, the result for link k is sum_q ds_k/dq v_q.
+        """
+        V = self.vectors
+        return [
+            V.add(*(V.times(slope, direction[q]) for q, slope in slopes.items()))
+            for slopes in self.slopes
+        ]
+
+    # --- frames ----------------------------------------------------------------------------------
+
+    def rotate(self, k: int, v: Vector, back: bool = False) -> Vector:
+        """Return the vector `v`, given in link k's frame, rotated by the angle of the link's joint.
+
+        With `back`, the vector is rotated by the negative angle. If the joint is prismatic, the
+        vector is returned unchanged.
+        """
+        V = self.vectors
+        if self.angular[k] == 0:
+            return v
+        c, s = self.cosine[k], self.sine[k]
+        i, j = AXES[self.links[k].axis]
+        out = list(v)
+        up, down = V.times(s, v[i]), V.times(s, v[j])
+        out[i] = V.add(V.times(c, v[i]), down if back else V.minus(down))
+        out[j] = V.add(V.minus(up) if back else up, V.times(c, v[j]))
+        return (out[0], out[1], out[2])
+
+    def to_parent(self, k: int, v: Vector) -> Vector:
+        """Return the components in the parent's frame of a vector given in link k's frame."""
+        return self.vectors.apply(self.rotation[k], self.rotate(k, v))
+
+    def from_parent(self, k: int, v: Vector) -> Vector:
+        """Return the components in link k's frame of a vector given in its parent's frame."""
+        return self.rotate(k, self.vectors.apply(transposed(self.rotation[k]), v), back=True)
+
+    def _arm(self, k: int) -> Vector:
+        """Return the vector from the parent's origin to link k's, in the parent's frame."""
+        V = self.vectors
+        link = self.links[k]
+        distance = V.times(self.linear[k], self.displacement[k])
+        slide = tuple(V.times(row[link.axis], distance) for row in self.rotation[k])
+        return V.plus(V.vector(link.offset), slide)
+
+    def on_axis(self, k: int, x: Expr) -> Vector:
+        """Return the vector x e in link k's frame, where e is the unit vector of its joint axis."""
+        v = list(ZERO)
+        v[self.links[k].axis] = x
+        return (v[0], v[1], v[2])
+
+    def turn(self, k: int, rate: Expr) -> Vector:
+        """Return the angular velocity S s of joint k in link k's frame, for its rate s."""
+        return self.on_axis(k, self.vectors.times(self.angular[k], rate))
+
+    def slide(self, k: int, rate: Expr) -> Vector:
+        """Return the velocity S s of joint k in link k's frame, for its rate s."""
+        return self.on_axis(k, self.vectors.times(self.linear[k], rate))
+
+    def along_joint(self, k: int, force: Vector, moment: Vector) -> Expr:
+        """Return the force S . f along joint k of a force and a moment in link k's frame."""
+        V, axis = self.vectors, self.links[k].axis
+        terms = ((self.angular[k], moment), (self.linear[k], force))
+        return V.add(*(V.times(x, v[axis]) for x, v in terms))
+
+    def angular_velocities(self, rates: Sequence[Expr]) -> list[Vector]:
+        """Return the angular velocity of each link, in its own frame (rad/s).
+
+        `rates` are the rates of the joints' displacements.
+        """
+        out: list[Vector] = []
+        for k, link in enumerate(self.links):
+            w = self.from_parent(k, out[link.parent]) if link.parent >= 0 else ZERO
+            out.append(self.vectors.plus(w, self.turn(k, rates[k])))
+        return out
+
+    def velocities(self, rates: Sequence[Expr], spin: Sequence[Vector]) -> list[Vector]:
+        """Return the velocity of each link's origin, in the link's own frame (m/s).
+
+        `rates` are the rates of the joints' displacements; `spin` are the angular velocities of the
+        links, as `angular_velocities` returns them.
+        """
+        V = self.vectors
+        out: list[Vector] = []
+        for k, link in enumerate(self.links):
+            v = ZERO
+            if (p := link.parent) >= 0:
+                v = V.plus(out[p], V.cross(spin[p], self.arm[k]))
+            v = self.from_parent(k, v)
+            out.append(V.plus(v, self.slide(k, rates[k])))
+        return out
 
 
 @dataclass(frozen=True)
@@ -101,11 +328,11 @@ class TreeDynamics:
         self.gravity = V.vector(tree.gravity)
         self.fixed_moment = V.vector(tree.fixed_moment)  # first moment of mass fixed in the world
         self.armature = [V.define(x.armature) for x in self.links]
-        self.inertia = self._grouped()
+        self.inertia = self.group_inertias()
 
     # --- inertial parameters ---------------------------------------------------------------------
 
-    def _link_inertia(self, link: Link) -> Inertia:
+    def link_inertia(self, link: Link) -> Inertia:
         """Return a link's inertia as given in the scene."""
         V = self.vectors
         inertia = dict(zip(ENTRIES, map(V.define, link.inertia), strict=True))
@@ -123,21 +350,24 @@ class TreeDynamics:
             {k: V.add(a.inertia.get(k, S.Zero), b.inertia.get(k, S.Zero)) for k in keys},
         )
 
-    def _grouped(self) -> list[Inertia]:
+    def group_inertias(self) -> list[Inertia]:
         """Group each link's inertial parameters: move those without a separate effect to the
         parent.
 
         Mass on the axis of a revolute joint, with equal moments of inertia across the axis and none
         about it, acts as if it belonged to the parent; so does the whole inertia tensor of a
-        prismatic link. Gautier & Khalil, IEEE Trans. Robotics and Automation 6(3), 1990.
+        prismatic link. A link on a screw joint keeps its parameters. Gautier & Khalil, IEEE Trans.
+        Robotics and Automation 6(3), 1990.
         """
         V, tree = self.vectors, self.tree
-        inertias = [self._link_inertia(link) for link in self.links]
+        inertias = [self.link_inertia(link) for link in self.links]
         for k in reversed(range(self.n)):
             link, own = self.links[k], inertias[k]
             i, j = AXES[link.axis]
             a = link.axis
-            if link.turns:
+            if link.angular != 0 and link.linear != 0:
+                continue
+            if link.angular != 0:
                 across = own.entry(j, j)
                 moved = Inertia(
                     own.mass, tree.on_axis(k, own.moment[a]), {(i, i): across, (j, j): across}
@@ -173,7 +403,7 @@ class TreeDynamics:
     def _to_parent_frame(self, k: int, x: Inertia, rotated: bool = True) -> Inertia:
         """Transform an inertia from link k's frame to its parent's frame and origin."""
         V, tree = self.vectors, self.tree
-        if rotated and self.links[k].turns:
+        if rotated and tree.angular[k] != 0:
             x = self._rotate_by_joint(k, x)
         x = self._rotate(tree.rotation[k], x)
         r = tree.arm[k]
@@ -256,20 +486,16 @@ class TreeDynamics:
                 acceleration = V.plus(acceleration, V.apply(matrices[p], r))
             alpha, acceleration = tree.from_parent(k, alpha), tree.from_parent(k, acceleration)
             parent_spin = tree.from_parent(k, spin[p]) if p >= 0 else ZERO
-            relative = tree.on_axis(k, rates[k])
-            if link.turns:
-                alpha = V.plus(
-                    alpha,
-                    V.cross(parent_spin, relative),
-                    tree.on_axis(k, joint_accelerations[k]),
-                )
-            else:
-                coriolis = V.cross(parent_spin, relative)
-                acceleration = V.plus(
-                    acceleration,
-                    V.scaled(coriolis, S(2)),
-                    tree.on_axis(k, joint_accelerations[k]),
-                )
+            alpha = V.plus(
+                alpha,
+                V.cross(parent_spin, tree.turn(k, rates[k])),
+                tree.turn(k, joint_accelerations[k]),
+            )
+            acceleration = V.plus(
+                acceleration,
+                V.scaled(V.cross(parent_spin, tree.slide(k, rates[k])), S(2)),
+                tree.slide(k, joint_accelerations[k]),
+            )
             alphas.append(alpha)
             origins.append(acceleration)
             squares = self._squares(spin[k])
@@ -332,7 +558,7 @@ class TreeDynamics:
         out: list[Expr] = [S.Zero] * self.n
         for k in reversed(range(self.n)):
             link = self.links[k]
-            out[k] = (n if link.turns else f)[k][link.axis]
+            out[k] = tree.along_joint(k, f[k], n[k])
             if link.parent >= 0:
                 force, moment = tree.to_parent(k, f[k]), tree.to_parent(k, n[k])
                 f[link.parent] = V.plus(f[link.parent], force)
@@ -393,20 +619,17 @@ class TreeDynamics:
         D: list[list[Expr]] = [[S.Zero] * self.n for _ in range(self.n)]
         for k, link in enumerate(self.links):
             x, a = beyond[k], link.axis
-            if link.turns:
-                moment = (x.entry(0, a), x.entry(1, a), x.entry(2, a))
-                force = V.cross(tree.on_axis(k, S.One), x.moment)
-            else:
-                force = tree.on_axis(k, x.mass)
-                moment = V.cross(x.moment, tree.on_axis(k, S.One))
-            D[k][k] = V.add((moment if link.turns else force)[a], self.armature[k])
+            turn, slide = tree.turn(k, S.One), tree.slide(k, S.One)
+            inertia = (x.entry(0, a), x.entry(1, a), x.entry(2, a))
+            moment = V.plus(V.scaled(inertia, tree.angular[k]), V.cross(x.moment, slide))
+            force = V.plus(V.cross(turn, x.moment), V.scaled(slide, x.mass))
+            D[k][k] = V.add(tree.along_joint(k, force, moment), self.armature[k])
             i = k
             while (p := self.links[i].parent) >= 0:
                 force, moment = tree.to_parent(i, force), tree.to_parent(i, moment)
                 moment = V.plus(moment, V.cross(tree.arm[i], force))
                 i = p
-                projected = (moment if self.links[i].turns else force)[self.links[i].axis]
-                D[k][i] = D[i][k] = projected
+                D[k][i] = D[i][k] = tree.along_joint(i, force, moment)
         return D
 
     def count_elimination_operations(self) -> int:

@@ -1,19 +1,22 @@
-"""Outputs on a tape: formulas of state, inputs and accelerations, and their derivatives."""
+"""Outputs on a tape, formulas of state, inputs and accelerations; derivatives of both on a tape."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from sympy import Expr, S, Symbol
+from sympy import Expr, Rational, S, Symbol
 
-from eomc.base.errors import EomcError, SceneError
-from eomc.derive.energies import leaves
+from eomc.base.errors import SceneError
+from eomc.derive.energies import leaves, tangent_symbols
 from eomc.derive.ldl import Rows, Vector
-from eomc.derive.linearize import LEAST_ROOT
 from eomc.derive.tape import NotDifferentiableError, Tape
-from eomc.model.symbols import MULTIPLIER, Output, dot, needed_definitions
+from eomc.model.symbols import Output, dot, needed_definitions
 from eomc.model.system import System, t
+
+# the bound of roots that are differentiated: far below any root but 0, its reciprocal is finite and
+# the square of that overflows
+LEAST_ROOT = {"double": Rational(1, 2**1000), "float": Rational(1, 2**120)}
 
 
 @dataclass(frozen=True)
@@ -92,7 +95,6 @@ def _outputs(
 ) -> Outputs:
     """Derive outputs on a given tape, with the atoms of known symbols. Raises RoughError."""
     state = (*system.q, *system.qd)
-    multipliers = {c.multiplier for c in system.constraints}
     rates = {**system.rates, **dict(zip(system.qd, system.qdd, strict=True)), t: S.One}
 
     def value(expr: Expr) -> Expr:
@@ -102,18 +104,8 @@ def _outputs(
         """
         rates_of: dict[Expr, Expr] = {}
         for derivative in expr.atoms(dot):
-            if unknown_multipliers := sorted(map(str, derivative.free_symbols & multipliers)):
-                name = unknown_multipliers[0].removesuffix(MULTIPLIER)
-                raise EomcError(
-                    f"{system.file or system.name}: dot(...) holds lambda_{name}, the multiplier "
-                    "of a constraint, whose rate is not known"
-                )
             position = value(derivative.args[0])
-            if unknown := tape.leaves_of([position]) & {*system.u, *system.qdd}:
-                raise EomcError(
-                    f"{system.file or system.name}: {derivative} is the rate of something that "
-                    f"depends on {', '.join(sorted(map(str, unknown)))}, whose rate is not known"
-                )
+            assert not tape.leaves_of([position]) & {*system.u, *system.qdd}, derivative
             (rates_of[derivative],) = tape.forward([position], rates)
         return tape.define(expr.xreplace(rates_of).xreplace(definitions))
 
@@ -133,3 +125,79 @@ def _outputs(
     count = len(variables) - len(parameters)
     slopes, sensitivity = (tuple(row[:count] for row in rows), tuple(row[count:] for row in rows))
     return Outputs(tape, values, slopes, sensitivity)
+
+
+# --- derivatives of the accelerations -------------------------------------------------------------
+
+# Names of the accelerations times columns up to which all columns are unrolled. Columns share their
+# factors on the tape, so that their number of operations is a fraction of this number.
+MAX_LINEARIZATION_SIZE = 25_000
+
+# (cause, remedy) of discontinuous accelerations: in formulas, and by stick-slip friction
+JUMPS = (
+    "the accelerations jump (sign or heaviside of a coordinate or velocity)",
+    "make them smooth, say tanh(x/width)",
+)
+STICKS = (
+    'accelerations jump where friction = "stick" holds and lets go',
+    'write friction = "smooth"',
+)
+
+
+def linearization(system: System, tape: Tape, accelerations: Sequence[Expr]) -> Rows:
+    """Return the derivatives [da/dq, da/dqd, da/du] of the accelerations a.
+
+    The result is a matrix (nq, 2 nq + nu) by rows. If its expressions would be too long, return a
+    single row (nq,) instead: the directional derivative of a. The components of the direction, one
+    for each coordinate, velocity and input, are then the symbols `tangent_symbols(system)`.
+
+    Raises
+    ------
+    SceneError
+        If the accelerations contain a discontinuous function.
+    """
+    entries = tangent_symbols(system)
+    if len(entries) * len(tape.live(accelerations)) > MAX_LINEARIZATION_SIZE:
+        return (_slopes(system, tape, accelerations, [entries])[0],)
+    columns = _slopes(system, tape, accelerations, [{x: S.One} for x in entries])
+    return tuple(zip(*columns, strict=True))
+
+
+def directional_derivatives(system: System, tape: Tape, values: Sequence[Expr]) -> Vector:
+    """Return the directional derivative of each of `values`, which depend on q, qd and u.
+
+    The direction v has one component for each coordinate, velocity and input; the components are
+    the symbols that `tangent_symbols(system)` returns. The result for a value f is
+    sum_x df/dx v_x over all x in (q, qd, u). The values and results are defined on `tape`, a list
+    of elementary operations. Raises SceneError if a value contains a discontinuous function.
+    """
+    return _slopes(system, tape, values, [tangent_symbols(system)])[0]
+
+
+def sensitivity(system: System, tape: Tape, accelerations: Sequence[Expr]) -> Rows:
+    """Return the derivatives da/dp of accelerations a with respect to the parameters, (nq, np).
+
+    The state and the inputs are held constant. Raises SceneError if the accelerations contain a
+    discontinuous function.
+    """
+    entries = [{p.symbol: S.One} for p in system.parameters]
+    return tuple(zip(*_slopes(system, tape, accelerations, entries), strict=True))
+
+
+def _slopes(
+    system: System,
+    tape: Tape,
+    accelerations: Sequence[Expr],
+    directions: Sequence[Mapping[Symbol, Expr]],
+) -> list[Vector]:
+    """Return the derivatives of accelerations along each of the given directions."""
+    try:
+        least = LEAST_ROOT[system.run.real]
+        return [tuple(tape.forward(accelerations, entries, least)) for entries in directions]
+    except NotDifferentiableError:
+        jump, smooth = STICKS if system.modes else JUMPS
+        message = (
+            f"{jump}, so they have no derivatives: {smooth}, or do without linearize and the "
+            "implicit methods"
+        )
+        raise SceneError([system.problem("run", message)]) from None

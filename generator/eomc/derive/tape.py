@@ -16,8 +16,9 @@ import sympy
 from sympy import Add, Expr, Mul, Pow, S, Symbol, tanh
 
 from eomc.base.errors import EomcError
+from eomc.model.algebra import classes_of_shape
 
-_CORNERS = (sympy.Abs, sympy.Max, sympy.Min, sympy.Heaviside, sympy.sign)
+_CORNERS = classes_of_shape("corner", "jump")
 _NOT_DIFFERENTIABLE = (sympy.DiracDelta, sympy.Derivative, sympy.Subs)
 
 

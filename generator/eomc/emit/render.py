@@ -1,33 +1,28 @@
-"""Rendering of a program to files by Jinja templates: header, source, example, self-test, package.
-
-This is the only module that uses Jinja for C. Each template gets its data as one frozen dataclass.
-"""
+"""Rendering of a program to files: header, source, example, self-test, package."""
 
 from __future__ import annotations
 
-import os
-import sys
+import math
+import textwrap
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from functools import cache
-from importlib.util import cache_from_source
-from pathlib import Path
-
-import jinja2
+from dataclasses import dataclass
 
 from eomc.base import resources
-from eomc.base.texts import docstring
 from eomc.base.texts import name as plain
-from eomc.emit import embedding, package, portable, selftest
-from eomc.emit.c_expression import REALS, indent
-from eomc.emit.c_function import break_comments
-from eomc.emit.c_names import Target, rename_for_c
-from eomc.emit.fmu.unit import Unit, render_unit
+from eomc.emit import package, portable, selftest
+from eomc.emit.common import c_function as c
+from eomc.emit.common.c_expression import REALS
+from eomc.emit.common.c_names import Target, rename_for_c
+from eomc.emit.common.functions import SceneFunctions
+from eomc.emit.common.public import KINDS, program_function
+from eomc.emit.common.templates import show
+from eomc.emit.fmu import Unit, render_unit
 from eomc.emit.optimised import files as optimised
-from eomc.emit.views import View
 from eomc.program.outline import weight
 from eomc.program.program import Program
 
+MAIN_ROWS = 200  # approximate number of rows that main.c prints
+COLUMNS_WIDTH = 88  # width of the column names there
 FAST = "fast"  # the folder of optimised C, from which the Python module is compiled
 
 
@@ -62,48 +57,6 @@ class Sources:
         return {file: text for file, text in self.files.items() if not file.endswith(".py")}
 
 
-@cache
-def environment() -> jinja2.Environment:
-    """Return the Jinja environment, in which undefined variables are errors.
-
-    Text is inserted into templates unchanged, except that it is escaped in HTML pages. The filter
-    `docstring` escapes text for docstrings, and `block` indents C statements.
-    """
-    loader = jinja2.FunctionLoader(lambda name: resources.text("templates", name))
-    result = jinja2.Environment(
-        loader=loader,
-        bytecode_cache=_bytecode(),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-        autoescape=lambda name: (name or "").endswith(".html.jinja"),
-    )
-    result.filters["docstring"] = docstring
-    result.filters["block"] = indent
-    return result
-
-
-def _bytecode() -> jinja2.BytecodeCache | None:
-    """Return a cache for compiled templates next to this module's bytecode, if it is writable.
-
-    Compiling the templates takes 0.2 s, a third of the derivation of a small scene.
-    """
-    folder = Path(cache_from_source(__file__)).parent
-    if sys.dont_write_bytecode or not os.access(folder, os.W_OK):
-        return None
-    return jinja2.FileSystemBytecodeCache(str(folder), "eomc-template-%s.cache")
-
-
-def show(view: View) -> str:
-    """Return the text of a generated file.
-
-    `view` has the data of the file. Its class attribute TEMPLATE names the Jinja template.
-    """
-    context = {field.name: getattr(view, field.name) for field in fields(view)}
-    return environment().get_template(view.TEMPLATE + ".jinja").render(context)
-
-
 def _plain_names(program: Program) -> None:
     """Raise ValueError if a name of the program is not plain, so that it cannot stand in code."""
     s = program.system
@@ -121,27 +74,50 @@ def render(program: Program, extension: str) -> Sources:
     program, written = rename_for_c(program)
     run = program.system.run
     target = Target(program, REALS[run.real], written)
-    binding = package.binding_view(target)
+    functions = SceneFunctions(target)
+    binding, cdef = package.binding(functions)
     name = program.system.name
-    methods = optimised.steppers(target)
     return Sources(
         name=name,
         files={
-            **portable.files(program, show, written=written),
-            **{f"{FAST}/{file}": text for file, text in optimised.files(methods, show).items()},
-            "main.c": break_comments(show(embedding.main_view(target))),
-            "selftest.c": break_comments(show(selftest.selftest_view(target))),
-            "CMakeLists.txt": show(embedding.cmake_view(target)),
-            f"{name}.pc.in": show(embedding.pkg_config_view(target)),
-            "costs.txt": show(embedding.costs_view(target)),
-            "__init__.py": show(package.face_view(target, extension)),
+            **portable.files(program, written=written),
+            **{f"{FAST}/{file}": text for file, text in optimised.files(functions).items()},
+            **companion_files(functions),
+            "selftest.c": selftest.selftest(functions),
+            "__init__.py": package.init(functions, extension),
             **resources.runtime(run.batch),
         },
-        binding=show(binding),
-        cdef=show(package.declarations_view(binding)),
-        stub=show(package.stub_view(target)),
+        binding=binding,
+        cdef=cdef,
+        stub=show("python/stub.pyi", functions, exports=package.exports(target)),
         operations=sum(map(weight, program.functions.values())),
     )
+
+
+def companion_files(functions: SceneFunctions) -> dict[str, str]:
+    """Return the texts of the files that accompany the C code, by file name.
+
+    main.c is an example program that simulates the scene and prints about MAIN_ROWS lines.
+    costs.txt has the operation counts of one call of each function, in the order of the header, and
+    the steps of the integration methods.
+    """
+    target, run = functions.target, functions.target.system.run
+    steps = max(1, math.ceil(run.duration / run.h * (1 - 1e-12)))
+    names = [c.scene_name for c in target.coordinates]
+    outputs = [o.name for o in target.outputs]
+    columns = ", ".join(("t", *names, *(f"{n}_dot" for n in names), *outputs, "energy"))
+    lines = [line.replace(" ", "") for line in textwrap.wrap(columns, COLUMNS_WIDTH)]
+    main = show(
+        "c/main.c", functions, rows=MAIN_ROWS, steps=steps, every=max(1, steps // MAIN_ROWS),
+        columns=lines,
+    )  # fmt: skip
+    evaluated = (program_function(target, n) for n in (*KINDS, "acceleration", "linearization"))
+    return {
+        "main.c": c.break_comments(main),
+        "CMakeLists.txt": show("c/CMakeLists.txt", functions),
+        f"{functions.prefix}.pc.in": show("c/package.pc.in", functions),
+        "costs.txt": show("c/costs.txt", functions, costs=[f for f in evaluated if f]),
+    }
 
 
 def unit(program: Program, version: int) -> Unit:
@@ -150,4 +126,7 @@ def unit(program: Program, version: int) -> Unit:
     version: version of the FMI standard, 2 or 3.
     """
     _plain_names(program)
-    return render_unit(program, version, show)
+    program, written = rename_for_c(program)
+    functions = SceneFunctions(Target(program, REALS[program.system.run.real], written))
+    files = portable.files(program, written=written)
+    return render_unit(functions, version, files)

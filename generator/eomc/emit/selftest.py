@@ -14,18 +14,17 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache, cached_property, partial
 from itertools import chain, islice
-from typing import Any, ClassVar
+from typing import Any
 
-from eomc.base.texts import FreeText
-from eomc.emit import adaptive
-from eomc.emit.c_expression import DOUBLE
-from eomc.emit.c_function import CFunction, member
-from eomc.emit.c_names import Target
-from eomc.emit.public import KINDS, Public, refuses
-from eomc.emit.views import stamp
+from eomc.emit.common.c_expression import DOUBLE
+from eomc.emit.common.c_function import CFunction, break_comments, member
+from eomc.emit.common.c_names import Target
+from eomc.emit.common.functions import SceneFunctions
+from eomc.emit.common.public import KINDS
+from eomc.emit.common.templates import show
 from eomc.integrators.tableaux import DP8, METHODS, Method
 from eomc.model.symbols import ALONG, add_suffix
-from eomc.program.interpret import evaluator, nearby
+from eomc.program.ir import evaluator, nearby
 from eomc.program.outline import weight
 from eomc.program.program import TIME
 from eomc.program.two_point import separate_angles
@@ -76,7 +75,7 @@ class TestArguments:
     Attributes
     ----------
     arrays
-        Values of q and qd, then of each array in `SelfTestView.arrays`.
+        Values of q and qd, then of each other array.
     t
         Time in s.
     span
@@ -84,7 +83,7 @@ class TestArguments:
     u
         Inputs; empty if the scene's signals supply them.
     other
-        Whether the parameters are `SelfTestView.other` rather than those of the scene.
+        Whether the parameters are a second set rather than those of the scene.
     """
 
     arrays: tuple[tuple[str, ...], ...]
@@ -101,7 +100,7 @@ class TestCase:
     Attributes
     ----------
     state
-        Index into `SelfTestView.states`.
+        Index of the state.
     expected
         Expected numbers as C literals.
     limit
@@ -126,59 +125,22 @@ class TestFunction:
         "batch", "derivative" or "adaptive".
     call
         The C call that is tested.
-    memory
-        C type of the workspace of an adaptive run; "" for other kinds.
     cases
         Expected results for several states.
+    method
+        C enumerator of the method of a run; "" if the scene has only one.
     """
 
     name: str
     kind: str
     call: str
-    memory: str
     cases: tuple[TestCase, ...]
+    method: str = ""
 
-
-@dataclass(frozen=True)
-class SelfTestView:
-    """Data for c/selftest.c.jinja: a C program that tests the generated functions.
-
-    Attributes
-    ----------
-    states
-        Arguments of the test calls.
-    other
-        Values of a second set of parameters; empty if no state uses it.
-    has_p
-        Whether the C functions take parameters.
-    arrays
-        Name and size of each array of a state besides q and qd.
-    tested
-        The test functions with their expected results.
-    events, inputs
-        Whether the scene has events and inputs.
-    most
-        Largest number of expected numbers in a case.
-    large, large_limit
-        Whether some states have large angles, and their limit in rad, for a comment.
-    """
-
-    TEMPLATE: ClassVar[str] = "c/selftest.c"
-    title: FreeText
-    stamp: tuple[FreeText, ...]
-    prefix: str
-    PREFIX: str
-    real: str
-    states: tuple[TestArguments, ...]
-    other: tuple[str, ...]
-    has_p: bool
-    arrays: tuple[tuple[str, str], ...]
-    tested: tuple[TestFunction, ...]
-    events: bool
-    inputs: bool
-    most: int
-    large_limit: str
-    large: bool
+    @property
+    def size(self) -> int:
+        """Largest number of expected numbers in a case."""
+        return max(len(case.expected) for case in self.cases)
 
 
 @dataclass(frozen=True)
@@ -203,29 +165,25 @@ class TestPoint:
     span: float = 0.0
 
 
-def selftest_view(target: Target) -> SelfTestView:
-    """Return the data for selftest.c: test calls, their expected results and error limits."""
-    cases = _Cases(target)
-    double = target.real is DOUBLE
-    tested = tuple(t for t in cases.test_functions() if t.cases)
+def selftest(functions: SceneFunctions) -> str:
+    """Return the text of selftest.c: test calls, their expected results and error limits."""
+    target = functions.target
+    cases = _Cases(functions)
+    tested = [t for t in cases.test_functions() if t.cases]
     other = cases.other_parameters if cases.uses_other else ()
-    return SelfTestView(
-        title=FreeText(target.system.title),
-        stamp=tuple(stamp(target)),
-        prefix=target.prefix,
-        PREFIX=target.PREFIX,
-        real=target.real.name,
-        states=tuple(cases.state(p) for p in cases.points),
-        other=tuple(target.literal(p.value) for p in other),
-        has_p=target.needs_p,
+    limit = "2^20" if cases.double else "2^13"
+    text = show(
+        "c/selftest.c",
+        functions,
+        states=[cases.state(p) for p in cases.points],
+        other=target.real.literals(p.value for p in other),
         arrays=cases.arrays,
         tested=tested,
-        events=bool(target.system.events),
-        inputs=bool(target.system.inputs),
-        most=max(len(case.expected) for t in tested for case in t.cases),
-        large_limit="2^20" if double else "2^13",
-        large=cases.has_large,
+        large_limit=limit if cases.has_large else "",
+        steps=RUN_STEPS,
+        tolerance=target.literal(1e-12 if cases.double else 1e-6),
     )
+    return break_comments(text)
 
 
 class _Cases:
@@ -235,12 +193,15 @@ class _Cases:
     refers to its state by the index in this list.
     """
 
-    def __init__(self, target: Target) -> None:
-        self.target, self.public = target, Public(target)
+    def __init__(self, functions: SceneFunctions) -> None:
+        self.target, self.public = functions.target, functions.public
+        target = self.target
         self.program, self.system = target.program, target.system
         self.double = target.real is DOUBLE
         self.points: list[TestPoint] = []
         self.has_large = self.uses_other = False
+        self.state_names = tuple(x.name for x in (*self.system.q, *self.system.qd))
+        self.states_after_steps: dict[tuple[Any, ...], Vector] = {}
         self.known: dict[str, Callable[[Mapping[str, float]], tuple[Vector, bool]]] = {}
 
     # values in Python
@@ -360,28 +321,35 @@ class _Cases:
 
     def at_state(self, point: TestPoint, x: Vector, t: float) -> TestPoint:
         """Return a copy of the point with the state x = [q; qd] and the time t (s)."""
-        names = (s.name for s in (*self.system.q, *self.system.qd))
-        values = {**point.values, **dict(zip(names, x, strict=True)), TIME: t}
+        values = {**point.values, **dict(zip(self.state_names, x, strict=True)), TIME: t}
         return TestPoint(values, point.signals, point.other, point.span)
 
     def state_of(self, point: TestPoint) -> Vector:
         """Return the state [q; qd] in a point's values as one list."""
-        return [point.values[s.name] for s in (*self.system.q, *self.system.qd)]
+        return [point.values[name] for name in self.state_names]
 
     def step(self, m: Method, point: TestPoint, x: Vector, t: float, h: float) -> Vector:
         """Return the state [q; qd] after one step of the integration method m.
 
         The step of size h (s) begins at time t (s) in the state x. `point` supplies the inputs and
         the parameters. Raises NoCaseError if the iteration over the stages does not converge.
+        Several cases begin with the same steps, whose results are cached.
         """
+        key = (m.name, t, h, *x, point.signals, *point.values.values())
+        if key not in self.states_after_steps:
+            self.states_after_steps[key] = self.compute_step(m, point, x, t, h)
+        return self.states_after_steps[key]
+
+    def compute_step(self, m: Method, point: TestPoint, x: Vector, t: float, h: float) -> Vector:
+        """Return the result of `step`, computed anew."""
         n, a = self.nq, [[0.0] * self.nq for _ in m.b]
-        A, AA, (c, b, b_a) = _floats(m.a), _floats(m.a_squared), _floats((m.c, m.b, m.b_a))
+        A, AA, (c, b, b_a) = _tableau(m.name)
 
         def stage(i: int) -> Vector:
             moved = list(x)
             for k in range(n):
-                of_q = sum(w * s[k] for w, s in zip(AA[i], a, strict=False))
-                of_qd = sum(w * s[k] for w, s in zip(A[i], a, strict=False))
+                of_q = sum([w * a[j][k] for j, w in AA[i]])
+                of_qd = sum([w * a[j][k] for j, w in A[i]])
                 moved[k] += h * (c[i] * x[n + k] + h * of_q)
                 moved[n + k] += h * of_qd
             return self.acceleration(point, moved, t + c[i] * h)
@@ -603,9 +571,8 @@ class _Cases:
         patterns of signs.
         """
         ulp = self.target.real.epsilon
-        names = [x.name for x in (*self.system.q, *self.system.qd)]
         moved = {}
-        for i, name in enumerate(names):
+        for i, name in enumerate(self.state_names):
             x, sign = point.values[name], (-1) ** (i * (turn + 1) + turn)
             moved[name] = x + sign * ulp * max(abs(x), 0.1)
         return replace(point, values={**point.values, **moved})
@@ -618,7 +585,7 @@ class _Cases:
             if name in ("D", "bias"):
                 cases += self.large_angle_cases(name)
             out = KINDS[name].out
-            kind = "status" if refuses(self.target, name) else "values" if out else "number"
+            kind = "status" if self.public.refuses(name) else "values" if out else "number"
             call = self.call(function, **({out: "out"} if out else {}))
             yield self.test_function(name, kind, call, cases)
         cases = [self.case(p, partial(self.value, "acceleration")) for p in self.near_points]
@@ -633,14 +600,14 @@ class _Cases:
         yield from self.test_motions()
 
     def test_function(
-        self, name: str, kind: str, call: str, cases: Sequence[TestCase | None], type: str = ""
+        self, name: str, kind: str, call: str, cases: Sequence[TestCase | None], method: str = ""
     ) -> TestFunction:
         """Return the data of a test of the C function `name`; cases that are None are left out.
 
         call: the tested C call. kind: form of the test's body in the template, see `TestFunction`.
-        type: C type of the workspace of an adaptive run, "" for other tests.
+        method: as in `TestFunction`.
         """
-        return TestFunction(name, kind, call, type, tuple(filter(None, cases)))
+        return TestFunction(name, kind, call, tuple(filter(None, cases)), method)
 
     def call(self, f: CFunction, **passed: str) -> str:
         """Return a C call of f in which the arguments are members of the struct s, the test state.
@@ -709,6 +676,7 @@ class _Cases:
         short = self.is_short
         for name in run.methods:
             m = METHODS[name]
+            method = self.public.method_enum(name) if self.public.method_type else ""
             if m.implicit and not short:
                 continue
             starts = self.start_points if short else self.start_points[:1]
@@ -725,15 +693,16 @@ class _Cases:
             ]
             more = [*points, *own]
             cases = [self.case(p, partial(self.rows, m), allowed) for p in more]
-            yield self.test_function(f"{name}_run", "run", self.run_call(name), cases)
+            yield self.test_function(f"{name}_run", "run", self.run_call(), cases, method)
             if run.batch:
                 cases = [self.case(p, partial(self.twice, m), allowed) for p in more]
-                yield self.test_function(f"{name}_batch", "batch", self.batch_call(name), cases)
+                call = self.batch_call()
+                yield self.test_function(f"{name}_batch", "batch", call, cases, method)
             if run.discretize:
                 cases = [self.derivative(m, p) for p in points]
                 call = self.call(self.public.derivative(name), Phi="Phi", Gamma="Gamma")
                 yield self.test_function(f"{name}_derivative", "derivative", call, cases)
-        if run.tolerance is not None and short:
+        if self.target.integrates and short:
             yield from self.adaptive_runs()
 
     @cached_property
@@ -785,9 +754,9 @@ class _Cases:
     def rows(self, m: Method, point: TestPoint) -> Vector:
         """Return the results of a run of three steps of method m from a point, as C stores them.
 
-        These are the last state [q; qd], then q after each step, then qd after each step.
+        These are the last state [q; qd], then q before the first and after each step, then qd.
         """
-        n, result = self.nq, self.after_steps(m, RUN_STEPS, point)
+        n, result = self.nq, [*self.state_of(point), *self.after_steps(m, RUN_STEPS, point)]
         states = [result[k : k + 2 * n] for k in range(0, len(result), 2 * n)]
         q, qd = ([v for x in states for v in x[part]] for part in (slice(n), slice(n, 2 * n)))
         return [*states[-1], *q, *qd]
@@ -805,35 +774,17 @@ class _Cases:
         """Return the state [q; qd] of a point, projected onto the constraints."""
         return self.project(point, self.state_of(point), point.values[TIME])
 
-    def run_call(self, name: str) -> str:
-        """Return the C call of a run of three steps of method `name`; it stores each state."""
-        return self.call(
-            self.public.run(name), q="out", qd="out + NQ", first="0", steps=str(RUN_STEPS),
-            u_stride="0", every="1", q_rows="out + 2*NQ", qd_rows=f"out + {2 + RUN_STEPS}*NQ",
-            memory="NULL", status="&status",
-        )  # fmt: skip
+    def run_call(self) -> str:
+        """Return the C call of a run."""
+        f = self.public.integrate
+        return self.call(f, q="out", qd="out + NQ", options="&options", output="&output")
 
-    def batch_call(self, name: str) -> str:
-        """Return the C call that steps a batch of two instances of the system by method `name`.
-
-        The instances have equal initial states.
-        """
+    def batch_call(self) -> str:
+        """Return the C call that steps a batch of two instances with equal initial states."""
+        f = self.public.integrate_batch
         return self.call(
-            self.public.batch(name), count="2", q="out", qd="out + 2*NQ", first="0",
-            steps=str(RUN_STEPS), u_instance="0", u_step="0", every="0", q_rows="NULL",
-            qd_rows="NULL", row_count="0", p_instance="0", completed="completed", status="status",
-        )  # fmt: skip
-
-    def adaptive_call(self) -> str:
-        """Return the C call of an adaptive run from the time t of the test state to t + span."""
-        return self.call(
-            self.public.adaptive(adaptive.METHOD.name), q="out", qd="out + NQ", t="&t",
-            t_end=f"t + {member('s', 'span')}", max_step="0",
-            tol=self.target.literal(1e-12 if self.double else 1e-6), steps="1000", times="NULL",
-            count="0", t_rows="NULL", q_rows="NULL", qd_rows="NULL",
-            room=f"{self.target.PREFIX}_NE_ROOM", events="&events", which="which",
-            event_rows="rows", memory="&memory", status="&status",
-        )  # fmt: skip
+            f, count="2", q="out", qd="out + 2*NQ", options="&options", output="output"
+        )
 
     def derivative(self, m: Method, point: TestPoint) -> TestCase | None:
         """Return the test case for the derivative of a step of method m along a direction.
@@ -842,8 +793,7 @@ class _Cases:
         ... in q, qd and the specified inputs. The expected derivative is a central difference.
         Returns None if it is not accurate enough.
         """
-        names = [x.name for x in (*self.system.q, *self.system.qd)]
-        names += self.input_names(point)
+        names = [*self.state_names, *self.input_names(point)]
 
         def difference(x: TestPoint, width: float) -> Vector:
             derivative = [0.0] * (2 * self.nq)
@@ -878,8 +828,7 @@ class _Cases:
         if not (self.system.constraints or self.system.modes):
             for k in range(len(self.system.own_events)):
                 cases += self.crossings(k)
-        memory = f"{self.public.adaptive(adaptive.METHOD.name).name}_memory"
-        yield self.test_function("adaptive", "adaptive", self.adaptive_call(), cases, memory)
+        yield self.test_function("adaptive", "adaptive", self.run_call(), cases)
 
     def spans(self) -> tuple[float, ...]:
         """Return the lengths (s) of adaptive runs to try, from the longest to the shortest."""
@@ -984,13 +933,12 @@ class _Cases:
 
         Each is found by changing the time, one coordinate or one velocity.
         """
-        names = [x.name for x in (*self.system.q, *self.system.qd)]
         for number in range(1, 5):
             for back in (1, -1):
                 point = self.point(number, 1.0)
                 moved = {x.name: back * point.values[x.name] for x in self.system.qd}
                 point = replace(point, values={**point.values, **moved})
-                for name in (TIME, *names):
+                for name in (TIME, *self.state_names):
                     try:
                         yield self.solve_event(k, point, name)
                     except NoCaseError:
@@ -1054,8 +1002,16 @@ class _Cases:
 
 
 @cache
-def _floats(rows: tuple[tuple[Fraction, ...], ...]) -> list[Vector]:
-    return [[float(x) for x in row] for row in rows]
+def _tableau(
+    name: str,
+) -> tuple[list[list[tuple[int, float]]], list[list[tuple[int, float]]], list[Vector]]:
+    """Return A and A^2 of a method as lists of (column, entry) by rows, and c, b and b A."""
+    m = METHODS[name]
+    A, AA = (
+        [[(j, float(x)) for j, x in enumerate(row) if x] for row in matrix]
+        for matrix in (m.a, m.a_squared)
+    )
+    return A, AA, [[float(x) for x in row] for row in (m.c, m.b, m.b_a)]
 
 
 def _single(x: float) -> float:

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from decimal import Decimal, localcontext
 from fractions import Fraction
 from functools import cached_property
-from math import comb, inf, lcm
+from math import comb, inf, isfinite, lcm
 from typing import Any
 
 Row = tuple[Fraction, ...]
@@ -59,6 +59,33 @@ class Method:
     nodes: Row = ()
     end: Row = ()
     sweeps: int = 0
+
+    @property
+    def description(self) -> str:
+        """The title with the order."""
+        return self.title if "order" in self.title else f"{self.title}, order {self.order}"
+
+    @property
+    def stability(self) -> str:
+        """The limits of the step size h as text, "" if there are none.
+
+        They are given for undamped oscillation with angular frequency omega, and for pure decay
+        with rate lambda.
+        """
+        undamped, decay = self.limits
+        text = f"h omega <= {undamped:.3g} undamped"
+        pure_decay = f", h lambda <= {decay:.3g} for pure decay." if isfinite(decay) else "."
+        return text + pure_decay if isfinite(undamped) else ""
+
+    @property
+    def about(self) -> tuple[str, ...]:
+        """Lines of a comment: description, reference, further properties and limits of h."""
+        return (
+            f"{self.description[0].upper()}{self.description[1:]}",
+            f"({self.source}).",
+            *(() if self.sweeps else self.notes),
+            *((f"Stability limits: {self.stability}",) if self.stability else ()),
+        )
 
     @property
     def stages(self) -> int:
@@ -319,7 +346,7 @@ def _legendre_roots(s: int) -> Row:
         return tuple(Fraction(round(x, _DIGITS)) for x in roots)
 
 
-def _gauss(s: int, name: str) -> Method:
+def gauss(s: int, name: str) -> Method:
     """Return the Gauss method: a_ij is the integral of the j-th Lagrange polynomial from 0 to
     c_i.
     """
@@ -341,7 +368,7 @@ def _gauss(s: int, name: str) -> Method:
     )
 
 
-GAUSS4, GAUSS6, GAUSS8 = (_gauss(s, f"gauss{2 * s}") for s in (2, 3, 4))
+GAUSS4, GAUSS6, GAUSS8 = (gauss(s, f"gauss{2 * s}") for s in (2, 3, 4))
 
 
 def _gauss_with_iteration(s: int, sweeps: int, name: str, limits: tuple[float, float]) -> Method:
@@ -355,7 +382,7 @@ def _gauss_with_iteration(s: int, sweeps: int, name: str, limits: tuple[float, f
     """
     order = min(2 * s, s + sweeps)
     return replace(
-        _gauss(s, name),
+        gauss(s, name),
         title=f"the method of Gauss and Legendre with {s} stages, found in {sweeps} sweeps",
         order=order,
         limits=limits,

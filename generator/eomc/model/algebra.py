@@ -13,12 +13,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
+import mpmath
 import sympy
 from sympy import Dummy, Expr
 
 from eomc.model.symbols import dot
+from eomc.runtime.mathematics import (
+    ANALYTIC,
+    DOUBLES,
+    FUNCTIONS,
+    MathFunction,
+    numpy_functions,
+)
 from eomc.scene import formulas
 from eomc.scene.formulas import MAX_LOG10, Formula, FormulaError
 
@@ -28,16 +37,75 @@ def _number(text: str) -> Expr:
     return sympy.Integer(int(text, 0)) if whole else sympy.Rational(text)
 
 
+class DefinedFunction(sympy.Function):  # type: ignore[misc]
+    """A function of formulas that SymPy does not have.
+
+    Its derivative, and its exact form in other functions, come from the table of functions.
+    """
+
+    is_real = True
+
+    @classmethod
+    def eval(cls, *args: Expr) -> Expr | None:
+        """Return the exact value if all arguments are numbers, else None (SymPy keeps the call)."""
+        row = FUNCTIONS[cls.__name__]
+        return _in_arguments(row, row.exact, args) if all(x.is_number for x in args) else None
+
+    def fdiff(self, argindex: int = 1) -> Expr:
+        """Return the derivative with respect to an argument, of which 1 is the first."""
+        row = FUNCTIONS[type(self).__name__]
+        return _in_arguments(row, row.derivatives[argindex - 1], self.args)
+
+    @property
+    def exact(self) -> Expr:
+        """The equal expression in functions of SymPy."""
+        row = FUNCTIONS[type(self).__name__]
+        return _in_arguments(row, row.exact, self.args)
+
+
+def _in_arguments(row: MathFunction, text: str, args: Sequence[Expr]) -> Expr:
+    """Return a formula of the table of functions as a SymPy expression of these arguments."""
+    known = dict(zip(row.arguments, args, strict=True))
+    return sympy.sympify(formulas.evaluate(formulas.parse(text), ALGEBRA, known.__getitem__))
+
+
+class cbrt(DefinedFunction):  # noqa: N801 - these print as the scene writes them
+    """The real cube root."""
+
+
+class expm1(DefinedFunction):  # noqa: N801
+    """The function exp(x) - 1."""
+
+
+class hypot(DefinedFunction):  # noqa: N801
+    """The length sqrt(x^2 + y^2)."""
+
+
+class log1p(DefinedFunction):  # noqa: N801
+    """The function log(1 + x)."""
+
+
+_DEFINED = {f.__name__: f for f in (cbrt, expm1, hypot, log1p)}
+# the functions of formulas in SymPy, and their classes; sqrt is a power
+CONSTRUCTORS: Mapping[str, Any] = {
+    name: _DEFINED.get(name) or getattr(sympy, str(f.name_in("sympy")))
+    for name, f in FUNCTIONS.items()
+}
+CLASSES: Mapping[str, Any] = {n: f for n, f in CONSTRUCTORS.items() if n != "sqrt"} | {"dot": dot}
 ALGEBRA: Mapping[str, Any] = {
     "number": _number,
     "pi": sympy.pi,
-    **{name: getattr(sympy, name) for name in (*formulas.ELEMENTARY, "sign")},
-    "abs": sympy.Abs,
+    **CONSTRUCTORS,
     "heaviside": lambda x: sympy.Heaviside(x),
-    "min": sympy.Min,
-    "max": sympy.Max,
     "dot": dot,
 }
+
+
+def classes_of_shape(*shapes: str) -> tuple[Any, ...]:
+    """Return the SymPy classes of the functions that are "steep", or have a "corner" or "jump"."""
+    return tuple(CONSTRUCTORS[f.name] for f in FUNCTIONS.values() if f.shape in shapes)
+
+
 UNDEFINED = (sympy.zoo, sympy.nan, sympy.oo, -sympy.oo)
 
 
@@ -47,15 +115,28 @@ def expression(formula: Formula, known: Mapping[str, Expr]) -> Expr:
     known: dict from each name that the formula may use to its SymPy expression. Raises
     FormulaError if the value is not real or not finite.
     """
+    if formula.expression is not None:
+        names = ((s, known[s.name]) for s in formula.expression.free_symbols)
+        return formula.expression.xreplace({s: e for s, e in names if e != s})
     try:
         value = sympy.sympify(formulas.evaluate(formula, ALGEBRA, known.__getitem__))
     except (ArithmeticError, ValueError, TypeError) as fault:
         raise FormulaError(str(fault)) from None
+    try:
+        check_real(value)
+    except FormulaError as fault:
+        values = {name: float(x) for name, x in known.items() if x.is_number and x.is_real}
+        advice = formulas.domain_advice(formula, values.__getitem__)
+        raise FormulaError(f"{fault}{advice if value.has(sympy.I) else ''}") from None
+    return value
+
+
+def check_real(value: Expr) -> None:
+    """Raise FormulaError if an expression divides by zero or is not real."""
     if value.has(*UNDEFINED):
         raise FormulaError("divides by zero")
     if value.has(sympy.I):
         raise FormulaError("has no real value")
-    return value
 
 
 # --- bounds on the digits of exact numbers --------------------------------------------------------
@@ -189,6 +270,20 @@ def bound(formula: Formula, known: Mapping[str, DigitBound]) -> DigitBound:
 # --- functions of numbers -------------------------------------------------------------------------
 
 
+def mpmath_functions(mp: Any) -> dict[str, Callable[..., Any]]:
+    """Return the functions of formulas in an mpmath context, by name."""
+
+    def function(f: MathFunction) -> Callable[..., Any]:
+        if (name := f.name_in("mpmath")) is not None:
+            return getattr(mp, name)  # type: ignore[no-any-return]
+        exact = formulas.parse(f.exact)
+        return lambda *args: formulas.evaluate(
+            exact, {**DOUBLES, "number": mp.mpf}, dict(zip(f.arguments, args, strict=True)).get
+        )
+
+    return {**DOUBLES, **{f.name: function(f) for f in ANALYTIC}}
+
+
 def compile_function(
     arguments: Sequence[Any],
     expressions: Any,
@@ -218,6 +313,10 @@ def compile_function(
     def renamed(e: Expr) -> Expr:
         return sympy.sympify(e).xreplace(stand_ins)
 
+    modules = modules if isinstance(modules, (list, tuple)) else [modules]
+    modules = [
+        x for m in modules for x in (*((_lacking_functions(m),) if isinstance(m, str) else ()), m)
+    ]
     several = isinstance(expressions, (list, tuple))
     replaced = [*map(renamed, expressions)] if several else renamed(expressions)
     known = [(stand_ins[name], renamed(e)) for name, e in definitions]
@@ -225,3 +324,12 @@ def compile_function(
     function: Callable[..., Any]
     function = sympy.lambdify([stand_ins[x] for x in arguments], replaced, modules, cse=shared)
     return function
+
+
+@cache
+def _lacking_functions(module: str) -> dict[str, Callable[..., Any]]:
+    """Return the functions of formulas that a module lacks; none where it is not known."""
+    if module not in ("mpmath", "numpy"):
+        return {}
+    own = mpmath_functions(mpmath) if module == "mpmath" else numpy_functions()
+    return {f.name: own[f.name] for f in ANALYTIC if f.name_in(module) is None}

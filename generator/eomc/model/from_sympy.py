@@ -1,563 +1,425 @@
-"""Conversion of a user's symbols and expressions, whatever their assumptions, for System.make.
+"""Conversion of the arguments of System.make to a scene whose formulas are SymPy expressions.
 
-SymPy functions that formulas of scenes do not have are rewritten exactly. A picture becomes the
-table [picture] of a scene with the names of the system and the picture only, and its expressions
-become formulas.
+The user's symbols, whatever their assumptions, are replaced by those of the system, and functions
+that formulas do not have are rewritten exactly. All else is checked as in a scene from TOML text.
 """
 
 from __future__ import annotations
 
-import hashlib
+import ast
 import json
-import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+import keyword
+import math
+import numbers
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import sympy
 from sympy import Expr, Symbol
+from sympy.codegen import cfunctions
 from sympy.core.function import AppliedUndef
 from sympy.core.relational import GreaterThan, LessThan, StrictGreaterThan, StrictLessThan
 from sympy.printing.str import StrPrinter
 
-from eomc.base import names
-from eomc.base.errors import EomcError, Problem, SceneError
-from eomc.model import api_arguments, constraints
-from eomc.model.algebra import UNDEFINED
-from eomc.model.api_arguments import argument_error, name_of, undeclared_error
-from eomc.model.generalized_potential import NotLinearError, split_potential
-from eomc.model.hybrid import Friction
-from eomc.model.mechanics import AnySystem
-from eomc.model.symbols import (
-    Constraint,
-    Coordinate,
-    Event,
-    Input,
-    Output,
-    Parameter,
-    dot,
-    multiplier_of,
-    needed_definitions,
-    symbol,
-    t,
-)
-from eomc.scene import read
-from eomc.scene.messages import is_in_degrees
-from eomc.scene.scene import RunSettings, Scene
-from eomc.scene.schema import ACTIONS, DIRECTIONS
+from eomc.base import names, texts
+from eomc.base.errors import SceneError
+from eomc.model import algebra
+from eomc.model.symbols import symbol, t
+from eomc.scene import formulas, read
+from eomc.scene.formulas import Formula, FormulaError, Value, suggest
+from eomc.scene.scene import Scene
+from eomc.scene.toml_text import ArgumentMap, Path
 
-_OF_NUMBERS = (
-    "a parameter's value is made of numbers; what depends on other parameters is a definition"
-)
-Ends = tuple[Expr | None, ...]  # the least and the largest value of an input
+_EXAMPLES = {  # of the arguments that are dicts
+    "parameters": "{m: 2.0}",
+    "forces": "{x: F}",
+    "definitions": "{y: l*cos(theta)}",
+    "outputs": '{"tip": x + l}',
+    "constraints": '{"rod": x**2 + y**2 - l**2}',
+    "limits": "{F: (-1, 1)}",
+    "events": '{"impact": y}',
+    "friction": "{x: mu*m*g}",
+    "units": '{m: "kg"}',
+    "picture": (
+        '{"points": {"tip": ["l*sin(theta)", "-l*cos(theta)"]}, "lines": [[[0, 0], "tip"]]}'
+    ),
+}
+_SETTINGS = (
+    "h", "duration", "real", "batch", "linearize", "discretize", "inverse_dynamics", "tolerance",
+)  # fmt: skip
 
 
-def _first_input(
-    expr: Expr, definitions: Sequence[tuple[Symbol, Expr]], inputs: Iterable[str]
-) -> str:
-    """Return the first input by name on which an expression depends, also by definitions, or ""."""
-    uses = expr.free_symbols.union(
-        *(e.free_symbols for _, e in needed_definitions(definitions, [expr]))
-    )
-    return min((i for i in inputs if symbol(i) in uses), default="")
-
-
-@dataclass(frozen=True, kw_only=True)
 class SystemArguments:
-    """The arguments of System.make as a user gave them; they are explained there.
+    """Converter of the arguments of System.make to a scene.
 
-    Arguments that were not given have their defaults, {} in place of None. They are not checked,
-    except for `run`, the settings of simulations and of the generated code.
+    values: the arguments by name, as the user gave them.
+
+    Attributes
+    ----------
+    places
+        The arguments as places of errors.
+    renamed
+        Names that C does not allow, as pairs (given name, name in the system).
+    own_symbols
+        Symbols, functions of time and derivatives of these that the user passed, by their names in
+        the system. Names that were given as text have none.
     """
 
-    name: str
-    coordinates: Any
-    kinetic: Any
-    potential: Any
-    dissipation: Any
-    parameters: Any
-    forces: Any
-    inputs: Any
-    definitions: Any
-    outputs: Any
-    constraints: Any
-    guess: Any
-    limits: Any
-    events: Any
-    friction: Any
-    picture: Any
-    units: Any
-    title: str
-    run: RunSettings
-
-
-class Maker:
-    """Converter of the arguments of System.make to a system with symbols of its own.
-
-    The user's symbols may have any assumptions and names. Symbols of the system, which replace
-    them, are real and have names that are valid in C. arguments: the arguments of System.make.
-    """
-
-    def __init__(self, arguments: SystemArguments) -> None:
-        name = arguments.name
-        if not isinstance(name, str):
-            raise argument_error("name", f"must be text, here {name!r}")
-        if why := names.module_fault(name):
-            raise EomcError(f"System.make: name: {why}")
-        self.name = name
-        self.arguments = arguments
-        self.map: dict[Any, Expr] = {}
-        self.used: dict[str, Expr] = {}  # symbols of the user's expressions, by their names
-        self.taken: dict[str, Any] = {}
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        self.values = values
+        events = values["events"] if isinstance(values["events"], Mapping) else {}
+        self.places = ArgumentMap(str(values["name"]), [*map(str, events)])
         self.renamed: list[tuple[str, str]] = []
-        self.fixed: dict[Symbol, bool] = {}  # parameters, and whether they are never negative
-        self.frictions: list[Friction] = []  # that stick
+        self.own_symbols: dict[str, Expr] = {}
+        self._map: dict[Any, Expr] = {}  # symbols of the system by those of the user
+        self._names: dict[str, str] = {}  # names in the system by the user's names
+        self._known = {"t"}  # names of the time and of declared quantities
+        self._rates: dict[str, str] = {}  # names of rates, as symbols of the user and in the system
+        self._nonnegative: dict[Symbol, bool] = {}  # parameters
 
-    def _name_of(self, one: Any, role: str) -> str:
-        if not isinstance(one, (Symbol, AppliedUndef)):
-            raise argument_error(role, f"{one!r} is not a symbol")
-        text = name_of(one)
-        used = names.plain(text) if names.fault(text) else text
-        if used in self.taken:
-            raise EomcError(f"System.make: {role} '{text}': the name '{used}' is taken already")
-        if used != text:
-            self.renamed.append((text, used))
-        self.taken[used] = one
-        return used
+    def scene(self) -> Scene:
+        """Return the checked scene. Raises SceneError for invalid arguments."""
+        scene = read.check_tree(self._tree(), self.places)
+        for p in scene.parameters:
+            if p.value < 0 and self._nonnegative[symbol(p.name)]:
+                why = f"its symbol can't be negative, here {p.value:g}"
+                raise self._fault(("parameters", p.name), why)
+        return scene
 
-    def _expression(self, value: Any, role: str, rule: str = "") -> Expr:
-        if isinstance(value, str):
-            known = {s.name: s for s in self.known}
-            value = api_arguments.parse_formula(value, role, known, rule)
-        expr = api_arguments.expression(value, role)
-        if not isinstance(value, str):
-            self.used |= {s.name: s for s in expr.free_symbols}
+    def picture_text(self) -> str:
+        """Return the picture as text, for the digest of the system."""
+        return json.dumps(self._picture(self.values["picture"]), sort_keys=True, default=str)
+
+    def _tree(self) -> dict[str, Any]:
+        """Return the scene as the tree of dicts and lists that its TOML text would have."""
+        values, value = self.values, self._value
+        declared = {
+            table: self._declare(table)
+            for table in ("coordinates", "parameters", "inputs", "definitions")
+        }
+        by_symbol = {key: self._by_name(key) for key in ("forces", "limits", "friction", "units")}
+        friction, limits = by_symbol["friction"], by_symbol["limits"]
+        for key, table in (("limits", "inputs"), ("friction", "coordinates")):
+            for name in by_symbol[key].keys() - declared[table].keys():
+                raise self._fault((key, name), f"'{name}' is not among the {table}")
+        tree: dict[str, Any] = {
+            "eomc": 1,
+            "name": values["name"],
+            "title": _line(values["title"]),
+            "coordinates": self._coordinates(declared["coordinates"], friction),
+            "parameters": {
+                name: {"value": value(("parameters", name), x)}
+                for name, x in declared["parameters"].items()
+            },
+            "inputs": {
+                name: {"signal": value(("inputs", name), 0 if x is None else x)}
+                for name, x in declared["inputs"].items()
+            },
+            "energy": {
+                key: value(("energy", key), values[key])
+                for key in ("kinetic", "potential", "dissipation")
+                if values[key] is not None
+            },
+            "run": {key: _setting(values[key]) for key in _SETTINGS if values[key] is not None},
+        }
+        for name, ends in limits.items():
+            tree["inputs"][name]["limits"] = self._limits(("inputs", name, "limits"), ends)
+        for table, entries in (
+            ("definitions", declared["definitions"]), ("forces", by_symbol["forces"]),
+        ):  # fmt: skip
+            tree[table] = {name: value((table, name), x) for name, x in entries.items()}
+        for table in ("constraints", "outputs"):
+            tree[table] = {
+                str(name): {"formula": value((table, str(name)), x)}
+                for name, x in self._dict(table).items()
+            }
+        self._add_units(tree, by_symbol["units"])
+        if events := self._dict("events"):
+            pairs = enumerate(events.items(), start=1)
+            tree["event"] = [self._event(("event", str(k)), name, x) for k, (name, x) in pairs]
+        if values["picture"] is not None:
+            tree["picture"] = self._picture(self._dict("picture"))
+        methods = values["methods"]
+        tree["run"]["method"] = [*methods] if isinstance(methods, (list, tuple)) else methods
+        if friction:
+            tree["run"]["friction"] = "stick"
+        return tree
+
+    def _fault(self, path: Path, message: str) -> SceneError:
+        return SceneError([self.places.problem(path, message)])
+
+    # --- names ------------------------------------------------------------------------------------
+
+    def _dict(self, argument: str) -> Mapping[Any, Any]:
+        value = self.values[argument]
+        if value is not None and not isinstance(value, Mapping):
+            why = f"give a dict, such as {_EXAMPLES[argument]}, here {value!r}"
+            raise self._fault((argument,), why)
+        return value or {}
+
+    def _symbol(self, argument: str, value: Any) -> Any:
+        if not isinstance(value, (str, Symbol, AppliedUndef)):
+            raise self._fault((argument,), f"{value!r} is not a symbol")
+        return symbol(value) if isinstance(value, str) else value
+
+    def _by_name(self, argument: str) -> dict[str, Any]:
+        """Return values by names in the system, from a dict with symbols or names as keys."""
+        values = {_name(self._symbol(argument, one)): x for one, x in self._dict(argument).items()}
+        return {self._names.get(name, name): x for name, x in values.items()}
+
+    def _declare(self, table: str) -> dict[str, Any]:
+        """Return values by names in the system, from a dict or a list of symbols; map these."""
+        value, entries = self.values[table], dict[str, Any]()
+        if table in _EXAMPLES:
+            value = self._dict(table)
+        elif not isinstance(value, (Mapping, list, tuple, set, frozenset)):
+            raise self._fault((table,), f"give a list or dict of symbols, here {value!r}")
+        for one in value:
+            own, text = self._symbol(table, one), _name(one)
+            name = names.plain(text) if names.fault(text) else text
+            if name in entries:
+                why = f"'{name}' stands here a second time: remove one of the two"
+                raise self._fault((table, text), why)
+            if name != text:
+                self.renamed.append((text, name))
+            entries[name] = value[one] if isinstance(value, Mapping) else None
+            self._replace(own, text, name)
+            if not isinstance(one, str):
+                self.own_symbols[name] = own
+            if table == "coordinates":
+                self._declare_rates(one, own, name)
+            elif table == "parameters":
+                self._nonnegative[symbol(name)] = getattr(own, "is_nonnegative", None) is True
+        return entries
+
+    def _replace(self, own: Any, text: str, name: str) -> None:
+        """Let a symbol of the system replace the user's symbol."""
+        self._map[own] = symbol(name)
+        if own == symbol(text):  # also without the assumption of real values
+            self._map[Symbol(text)] = symbol(name)
+        self._names[text] = self._names[str(own)] = name
+        self._known.add(name)
+
+    def _declare_rates(self, one: Any, own: Any, name: str) -> None:
+        """Map velocity and acceleration of a coordinate; `one` is its symbol as it was given."""
+        text = _name(own)
+        for order, suffix in enumerate(("_dot", "_ddot"), start=1):
+            if isinstance(own, AppliedUndef):
+                (time,) = own.args
+                rate = own.diff(time, order)
+                self._map[time] = t
+                self.own_symbols |= {"t": time, name + suffix: rate}
+                self._replace(rate, text + suffix, name + suffix)
+                continue
+            self._replace(Symbol(text + suffix, **own.assumptions0), text + suffix, name + suffix)
+            if not isinstance(one, str):
+                self.own_symbols[name + suffix] = Symbol(text + suffix, real=own.is_real)
+                self._rates[text + suffix] = name + suffix
+
+    # --- entries ----------------------------------------------------------------------------------
+
+    def _coordinates(
+        self, coordinates: Mapping[str, Any], friction: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        guess, entries = self.values["guess"], dict[str, Any]()
+        if not isinstance(guess, (list, tuple, set, frozenset)):
+            why = f"give a list of coordinates, such as [x], here {guess!r}"
+            raise self._fault(("guess",), why)
+        free = {self._names.get(n, n) for n in (_name(self._symbol("guess", x)) for x in guess)}
+        for name in sorted(free - coordinates.keys()):
+            raise self._fault(("guess",), f"'{name}' is not among the coordinates")
+        for name, whole in coordinates.items():
+            pair = whole if isinstance(whole, (tuple, list)) else (whole, None)
+            if len(pair) != 2:
+                why = f"give a start, or a pair (start, rate), here {whole!r}"
+                raise self._fault(("coordinates", name), why)
+            values: dict[str, Any] = dict(zip(("start", "rate"), pair, strict=True))
+            values["friction"] = friction.get(name)
+            entries[name] = {
+                key: self._value(("coordinates", name, key), x)
+                for key, x in values.items()
+                if x is not None
+            }
+            if name in free:
+                entries[name]["guess"] = True
+        return entries
+
+    def _limits(self, path: Path, ends: Any) -> Any:
+        if not isinstance(ends, (tuple, list)) or len(ends) != 2:
+            return ends
+        infinite = (-math.inf, math.inf)
+        return [
+            end if x is None or x == end else self._value(path, x)
+            for x, end in zip(ends, infinite, strict=True)
+        ]
+
+    def _event(self, path: Path, name: Any, entry: Any) -> dict[str, Any]:
+        table: dict[str, Any] = {"name": str(name)}
+        for one, x in (entry if isinstance(entry, Mapping) else {"when": entry}).items():
+            key = self._names.get(str(one), str(one))
+            texts_only = key in ("direction", "action", "note")
+            table[key] = x if texts_only else self._value((*path, key), x)
+        return table
+
+    def _add_units(self, tree: dict[str, Any], units: Mapping[str, Any]) -> None:
+        known = dict.fromkeys(tree["definitions"])
+        for table in ("coordinates", "parameters", "inputs", "constraints", "outputs"):
+            known |= tree[table]
+            for name in tree[table].keys() & units.keys():
+                tree[table][name]["unit"] = _line(units[name])
+        for name in units.keys() - known.keys():
+            why = f"'{name}' is no coordinate, parameter, input, constraint or output"
+            raise self._fault(("units",), why + suggest(name, known))
+
+    def _picture(self, value: Any) -> Any:
+        """Return a value of the picture: sequences as lists, expressions as formulas."""
+        if isinstance(value, Mapping):
+            return {str(key): self._picture(entry) for key, entry in value.items()}
+        if isinstance(value, sympy.MatrixBase):
+            value = value.flat()
+        if hasattr(value, "tolist"):  # NumPy's
+            value = value.tolist()
+        if isinstance(value, (list, tuple)):
+            return [self._picture(entry) for entry in value]
+        return self._value(("picture",), value) if isinstance(value, Expr) else value
+
+    # --- expressions ------------------------------------------------------------------------------
+
+    def _value(self, path: Path, value: Any) -> Value:
+        """Return a number, the text of a formula, or a formula with an expression of the system."""
+        if isinstance(value, (str, int)):
+            return value
+        if isinstance(value, numbers.Real) and not isinstance(value, Expr):
+            return float(value)
+        try:
+            expr = sympy.sympify(value)
+        except (sympy.SympifyError, TypeError, AttributeError, ValueError, RecursionError):
+            expr = None
+        if isinstance(expr, (sympy.MatrixBase, sympy.MatrixExpr)):
+            why = "give one expression, not a matrix of {} by {}: its entry"
+            raise self._fault(path, why.format(*expr.shape))
+        if not isinstance(expr, Expr):
+            raise self._fault(path, f"{value!r} is not an expression")
+        rates = ((s, self._rates[s.name]) for s in expr.free_symbols if s.name in self._rates)
+        self.own_symbols |= {rate: s for s, rate in rates}
+        try:
+            expr = rewrite_functions(self._in_own_symbols(expr), self._nonnegative)
+            algebra.check_real(expr)
+            check_functions(expr)
+        except FormulaError as fault:
+            raise self._fault(path, str(fault)) from None
+        return as_formula(expr)
+
+    def _in_own_symbols(self, expr: Expr) -> Expr:
+        """Return an expression in symbols of the system. Raises FormulaError for another symbol."""
         expr = expr.replace(
             lambda e: isinstance(e, sympy.Derivative),
             lambda e: e if isinstance(e.expr, AppliedUndef) else e.doit(),
         )
-        expr = expr.replace(
-            lambda e: isinstance(e, sympy.Derivative), lambda e: self.map.get(e, e)
-        ).xreplace(self.map)
-        functions = expr.atoms(AppliedUndef, sympy.Derivative) - expr.atoms(dot)
-        strange = sorted(map(str, functions))
-        strange += sorted(s.name for s in expr.free_symbols if s not in self.known)
-        if any(d.derivative_count > 1 for d in expr.atoms(sympy.Derivative)):
-            raise argument_error(role, "accelerations are what is solved for, none can be used")
-        if strange == ["t"] and not rule:
-            raise argument_error(
-                role,
-                "this t is not the time: write eomc.model.system.t, or "
-                "dynamicsymbols._t where coordinates are dynamicsymbols",
-            )
-        if strange:
-            raise undeclared_error(role, strange, (s.name for s in self.known), rule)
-        try:
-            expr = rewrite_functions(expr, self.fixed)
-        except JumpError as jump:
-            raise argument_error(role, str(jump)) from None
-        if expr.has(*UNDEFINED, sympy.I):
-            raise EomcError(f"System.make: {role}: {expr} is not a real, finite expression")
-        api_arguments.check_functions(expr, role)
-        return expr
+        expr = expr.replace(lambda e: isinstance(e, sympy.Derivative), self._own_symbol)
+        expr = expr.xreplace(self._map)
+        others = expr.atoms(AppliedUndef) | expr.free_symbols
+        return expr.xreplace({e: self._own_symbol(e) for e in others})
 
-    def _parameter(self, one: Any, value_: Any, units: Mapping[str, str]) -> Parameter:
-        value = api_arguments.number(value_, f"parameter {one}", _OF_NUMBERS)
-        never_negative = getattr(one, "is_nonnegative", None) is True
-        if never_negative and value < 0:
-            raise argument_error(
-                f"parameter {one}", f"its symbol can't be negative, here {value:g}"
-            )
-        unit = units.get(name_of(one), "")
-        declared = Parameter(self._declare(one, "parameter"), value, unit)
-        self.fixed[declared.symbol] = never_negative
-        return declared
-
-    def make(self, of: type[AnySystem]) -> AnySystem:
-        """Make a mechanical system from the arguments and return it.
-
-        of: class of the result, such as System. Raises EomcError for invalid arguments.
-        """
-        arguments = self.arguments
-        starts = api_arguments.symbols(arguments.coordinates, "coordinates", None)
-        parameters = api_arguments.by_symbol(arguments.parameters, "parameters", "{m: 2.0}")
-        forces = api_arguments.by_name(arguments.forces, "forces", "{x: F}")
-        definitions = api_arguments.by_symbol(
-            arguments.definitions, "definitions", "{y: l*cos(theta)}"
-        )
-        units = self._units()
-        if not starts:
-            raise EomcError("System.make: give at least one coordinate")
-        coordinates = [self._coordinate(one, units) for one in starts]
-        declared = [self._parameter(p, v, units) for p, v in parameters.items()]
-        coordinates = [*self._with_initial_values(coordinates, starts.values(), declared)]
-        coordinates = self._mark_fixed(coordinates, [*starts])
-        pending = api_arguments.symbols(arguments.inputs, "inputs", 0)
-        named = map(name_of, (*starts, *parameters, *pending, *definitions))
-        outputs = [*map(str, arguments.outputs)]
-        api_arguments.check_units(
-            units, [*named, *map(str, arguments.constraints), *outputs], outputs
-        )
-        input_names = {i: self._declare(i, "input") for i in pending}
-        ends = self._limits(pending, declared)
-        self.known = {c.q for c in coordinates} | {c.qd for c in coordinates} | {t}
-        self.known |= {symbol(n) for n in self.taken}
-        ordered = []
-        for one, body in definitions.items():
-            expr = self._expression(body, f"definition {one}")
-            defined = symbol(self._declare(one, "definition"))
-            self.known.add(defined)
-            ordered.append((defined, expr))
-        if unknown := [f for f in forces if f not in map(name_of, starts)]:
-            raise EomcError(f"System.make: forces: {', '.join(unknown)} not among the coordinates")
-        rubbed = api_arguments.by_name(arguments.friction, "friction", "{x: mu*m*g}")
-        sticks = [f"{self.map[x].name}_sticks" for x in starts if name_of(x) in rubbed]
-        used_inputs = input_names.values()
-        drawn, drawn_text = None, ""
-        if arguments.picture is not None:
-            drawn, drawn_text = picture_scene(
-                arguments.picture, self._expression, coordinates, declared, used_inputs, ordered
-            )
-        energies = self._energies(ordered, [c.qd for c in coordinates], used_inputs)
-        fields: dict[str, Any] = {
-            "name": self.name,
-            "coordinates": tuple(coordinates),
-            **energies,
-            "forces": tuple(
-                self._expression(forces.get(name_of(c), 0), f"force on {c}") for c in starts
-            ),
-            "parameters": tuple(declared),
-            "inputs": tuple(self._inputs(pending, input_names, units, ends, ordered)),
-            "definitions": tuple(ordered),
-            **self._constraints(coordinates, ordered, used_inputs, units),
-            "events": tuple(self._events(starts, declared)),
-            "outputs": tuple(
-                self._outputs(
-                    starts, coordinates, units, [*map(str, arguments.constraints), *sticks]
+    def _own_symbol(self, e: Expr) -> Expr:
+        if e in self._map:
+            return self._map[e]
+        rate = isinstance(e, sympy.Derivative)
+        name = f"{_name(e.expr)}_{'d' * e.derivative_count}ot" if rate else _name(e)
+        if name in self._known and e != symbol(name):
+            if name == "t":
+                raise FormulaError(
+                    "this t is not the time: write eomc.model.system.t, or "
+                    "dynamicsymbols._t where coordinates are dynamicsymbols"
                 )
-            ),
-            "run": arguments.run,
-            "title": arguments.title or self.name.replace("_", " ").capitalize(),
-        }
-        self.frictions = list(self._frictions(starts, declared))
-        whole = sympy.srepr(sorted(fields.items())) + drawn_text + str(self.frictions or "")
-        return of(
-            **fields,
-            digest=hashlib.sha256(whole.encode()).hexdigest(),
-            renamed=tuple(self.renamed),
-            picture_scene=drawn,
-            own_symbols=self._own_symbols(starts),
-        )
-
-    def _units(self) -> dict[str, str]:
-        """Return the units by name."""
-        units = api_arguments.by_name(self.arguments.units, "units", '{m: "kg"}')
-        for text in (self.arguments.title, *units.values()):
-            if not isinstance(text, str):
-                raise EomcError(f"System.make: a title or unit is a text, not {text!r}")
-        return units
-
-    def _energies(
-        self, definitions: Sequence[tuple[Symbol, Expr]], velocities: Sequence[Symbol],
-        inputs: Iterable[str],
-    ) -> dict[str, Expr]:  # fmt: skip
-        """Return the energies by field name, the potential split into its parts."""
-        expressions = {
-            role: self._expression(getattr(self.arguments, role), role)
-            for role in ("kinetic", "potential", "dissipation")
-        }
-        for role, energy in expressions.items():
-            if used_input := _first_input(energy, definitions, inputs):
-                why = f"{used_input} is an input, and an energy can't depend on inputs"
-                raise argument_error(role, f"{why}: let it act through forces")
-            what = f"the {role} energy"
-            api_arguments.check_smooth(energy, role, dict(definitions), self.fixed.keys(), what)
-        try:
-            expressions["potential"], linear = split_potential(
-                expressions["potential"], definitions, velocities
+            raise FormulaError(
+                f"the '{name}' declared there is another symbol than this: take the same one"
             )
-        except NotLinearError as why:
-            raise argument_error("potential", str(why)) from None
-        return expressions if linear == 0 else {**expressions, "linear_potential": linear}
+        if not name.isidentifier() or keyword.iskeyword(name):
+            raise FormulaError(f"'{name}' is not declared")
+        return symbol(name)
 
-    def _coordinate(self, one: Any, units: Mapping[Any, str]) -> Coordinate:
-        """Return a coordinate and declare its symbols."""
-        name = self._name_of(one, "coordinate")
-        c = Coordinate(name, units.get(name_of(one), ""))
-        self.map[one] = c.q
-        if isinstance(one, AppliedUndef):
-            time = one.args[0]
-            self.map[sympy.Derivative(one, time)] = c.qd
-            self.map[time] = t
-        else:
-            self.map[Symbol(f"{one}_dot", **one.assumptions0)] = c.qd
-            if one == symbol(one.name):
-                self.map[Symbol(one.name)], self.map[Symbol(f"{one}_dot")] = c.q, c.qd
-        return c
 
-    def _with_initial_values(
-        self,
-        coordinates: Iterable[Coordinate],
-        starts: Iterable[Any],
-        parameters: Iterable[Parameter],
-    ) -> Iterator[Coordinate]:
-        """Yield the coordinates with initial values, over parameters; given values are fixed."""
-        values = {p.symbol: p.value for p in parameters}
-        self.known = {*values}
-        rule = "a start is made of numbers and parameters"
-        for c, whole in zip(coordinates, starts, strict=True):
-            role, ends = f"start of {c.name}", []
-            for x in api_arguments.initial_values(whole, role):
-                follows = ""
-                if isinstance(x, (str, Expr)):
-                    x = self._expression(x, role, rule)
-                    if x.has(dot):
-                        raise undeclared_error(role, ["dot(...)"], (), rule)
-                    if x.free_symbols:
-                        follows = formula_text(x)
-                        api_arguments.parse_formula(
-                            follows, role, {s.name: s for s in values}, rule
-                        )
-                    x = x.xreplace(values)
-                ends.append((None if x is None else api_arguments.number(x, role), follows))
-            (start, follows), (rate, rate_follows) = ends
-            yield replace(
-                c, start=start or 0.0, rate=rate or 0.0, start_fixed=start is not None,
-                rate_fixed=rate is not None, follows=follows, rate_follows=rate_follows,
-            )  # fmt: skip
+def _name(one: Any) -> str:
+    """Return the name of a symbol, of a function of time such as theta(t), or of a text."""
+    return str(one.func.__name__ if isinstance(one, AppliedUndef) else one)
 
-    def _mark_fixed(
-        self, coordinates: Sequence[Coordinate], keys: Sequence[Any]
-    ) -> list[Coordinate]:
-        """Return the coordinates with initial values marked as fixed or as guesses."""
-        guess, rows = self.arguments.guess, bool(self.arguments.constraints)
-        if isinstance(guess, str) or not isinstance(guess, (list, tuple, set, frozenset)):
-            raise argument_error(
-                "guess", f"give a list of coordinates, such as [x], here {guess!r}"
-            )
-        guessed = {name_of(api_arguments.symbol_of(one, "guess")) for one in guess}
-        if unknown := sorted(guessed - {name_of(one) for one in keys}):
-            raise argument_error("guess", f"{', '.join(unknown)} not among the coordinates")
-        if guessed and not rows:
-            raise argument_error(
-                "guess", "constraints move a guess, and there are none: leave it out"
-            )
-        free = [name_of(one) in guessed for one in keys]
-        return [
-            replace(
-                c,
-                start_fixed=not rows or (c.start_fixed and not moves),
-                rate_fixed=not rows or (c.rate_fixed and not moves),
-            )
-            for c, moves in zip(coordinates, free, strict=True)
-        ]
 
-    def _constraints(
-        self, coordinates: Sequence[Coordinate], ordered: Sequence[tuple[Symbol, Expr]],
-        inputs: Iterable[str], units: Mapping[Any, str],
-    ) -> dict[str, Any]:  # fmt: skip
-        """Return the constraints and their warnings by field name; empty without constraints."""
-        rows = self.arguments.constraints
-        if not isinstance(rows, Mapping):
-            example = '{"rod": x**2 + y**2 - l**2}'
-            raise argument_error("constraints", f"give a dict, such as {example}, here {rows!r}")
-        declared = []
-        moving = (s.name for c in coordinates for s in (c.qd, c.qdd))
-        taken = {*self.taken, *moving, "energy"}
-        for one, formula in rows.items():
-            name, role = api_arguments.valid_name(one, "constraints"), f"constraint {one}"
-            if name in taken:
-                raise EomcError(f"System.make: {role}: the name '{name}' is taken already")
-            expr = self._expression(formula, role)
-            api_arguments.check_smooth(expr, role, dict(ordered), self.fixed.keys(), "it")
-            if used_input := _first_input(expr, ordered, inputs):
-                why = (
-                    f"{used_input} is an input, whose rate is not known: let it act through forces"
-                )
-                raise argument_error(role, why)
-            declared.append(Constraint(name, expr, unit=units.get(name, "")))
+def _line(text: Any) -> Any:
+    return texts.line(text) if isinstance(text, str) else text
 
-        def fault(row: Constraint, message: str) -> None:
-            raise argument_error(f"constraint {row.name}", f"{row.formula} {message}")
 
-        doubts: list[Problem] = []
+def _setting(value: Any) -> Any:
+    """Return a number of any type as a float, and any other value unchanged."""
+    if isinstance(value, bool) or not isinstance(value, (numbers.Real, Expr)):
+        return value
+    return value if isinstance(value, Expr) and not value.is_number else float(value)
 
-        def doubt(row: Constraint, message: str) -> None:
-            message = f"{row.formula} {message}"
-            doubts.append(
-                Problem(
-                    message, f"constraints.{row.name}", f"System {self.name}", severity="warning"
-                )
-            )
 
-        checked = constraints.ConstraintChecker(coordinates, ordered, {}, fault, doubt).classify(
-            declared
-        )
-        return {"constraints": checked, "warnings": tuple(doubts)} if declared else {}
+# --- formulas -------------------------------------------------------------------------------------
 
-    def _inputs(
-        self, signals: Mapping[Any, Any], used: Mapping[Any, str], units: Mapping[Any, str],
-        limits: Mapping[str, Ends], definitions: Sequence[tuple[Symbol, Expr]],
-    ) -> Iterator[Input]:  # fmt: skip
-        """Yield the inputs, with their names in the system."""
-        for one, signal in signals.items():
-            name, role = name_of(one), f"signal of {one}"
-            value = self._expression(signal, role)
-            if used_input := _first_input(value, definitions, used.values()):
-                raise argument_error(
-                    role, f"{used_input} is an input, and a signal can't depend on inputs"
-                )
-            ends = limits.get(name, (None, None))
-            yield Input(used[one], units.get(name, ""), value, limits=ends)
+_KNOWN = (sympy.Add, sympy.Mul, sympy.Pow, Symbol, sympy.Number, sympy.NumberSymbol)
+_MOST_TERMS = 50  # in a parenthesis: the depth of the syntax tree is their number
 
-    def _limits(self, inputs: Iterable[Any], parameters: Iterable[Parameter]) -> dict[str, Ends]:
-        """Return the limits of inputs by name, over parameters."""
-        values = {p.symbol: p.value for p in parameters}
-        self.known = {*values}
-        known, checked = {name_of(i) for i in inputs}, dict[str, Ends]()
-        rule = "limits are made of numbers and parameters"
-        limits = api_arguments.by_name(self.arguments.limits, "limits", "{F: (-1, 1)}")
-        for name, pair in limits.items():
-            role = f"limits of {name}"
-            if name not in known:
-                raise argument_error(role, f"inputs are {', '.join(sorted(known)) or 'none'}")
-            if not isinstance(pair, (tuple, list)) or len(pair) != 2:
-                raise argument_error(role, f"give the least and the largest value, here {pair!r}")
-            ends = zip(pair, (-sympy.oo, sympy.oo), strict=True)
-            least, most = (
-                None if x is None or x == end else self._expression(x, role, rule)
-                for x, end in ends
-            )
-            if least is not None and most is not None and (most - least).xreplace(values) <= 0:
-                raise argument_error(role, f"{least}, the least value, is not below {most}")
-            checked[name] = (least, most)
-        return checked
 
-    def _events(self, starts: Iterable[Any], parameters: Iterable[Parameter]) -> Iterator[Event]:
-        """Yield the events; each is given as a formula or a dict as in [[event]]."""
-        events = self.arguments.events
-        if not isinstance(events, Mapping):
-            raise argument_error("events", f'give a dict, such as {{"impact": y}}, here {events!r}')
-        state: dict[str, str] = {}  # names in the system, by names that the user may write
-        for one in starts:
-            name = self.map[one].name
-            rate = one.diff() if isinstance(one, AppliedUndef) else f"{one}_dot"
-            state |= {str(one): name, name_of(one): name}
-            state |= {str(rate): f"{name}_dot", f"{name_of(one)}_dot": f"{name}_dot"}
-        state |= {name_of(self.taken[p.name]): p.name for p in parameters}
-        for name, entry in events.items():
-            called, role = api_arguments.valid_name(name, "events"), f"event {name}"
-            table = {str(k): x for k, x in entry.items()} if isinstance(entry, Mapping) else {}
-            when = self._expression(table.pop("when", None) if table else entry, role)
-            if not when.free_symbols:
-                raise argument_error(role, f"{when} never crosses zero: it has no names")
-            direction, action = table.pop("direction", "both"), table.pop("action", "record")
-            if not isinstance(note := table.pop("note", ""), str):
-                raise argument_error(role, f"note is a text, not {note!r}")
-            for key, word, known in (
-                ("direction", direction, DIRECTIONS), ("action", action, ACTIONS),
-            ):  # fmt: skip
-                if word not in known:
-                    raise argument_error(role, f"{key} is one of {', '.join(known)}, here {word!r}")
-            if strange := [key for key in table if key not in state]:
-                why = f"{strange[0]} is no coordinate, velocity or parameter, which a jump sets"
-                raise argument_error(role, why)
-            if (action == "jump") != bool(table):
-                remedy = 'add "action": "jump" where something is set, and only there'
-                raise argument_error(role, remedy)
-            jump = ((state[key], self._expression(x, f"{role}: {key}")) for key, x in table.items())
-            yield Event(called, when, direction, action, tuple(jump), note=note)
+def check_functions(expr: Expr) -> None:
+    """Raise FormulaError if an expression contains a function that formulas do not have."""
+    known = (*_KNOWN, *algebra.CLASSES.values())
+    queue, visited = [expr], {expr}
+    while queue:
+        part = queue.pop()
+        if not isinstance(part, known):
+            raise FormulaError(formulas.unknown_function(type(part).__name__))
+        if isinstance(part, sympy.Heaviside) and part.args[1] != sympy.S.Half:
+            raise FormulaError(f"{part}: Heaviside(x) is 1/2 at 0, without another value")
+        more = [arg for arg in part.args if arg not in visited]
+        visited.update(more)
+        queue += more
 
-    def _frictions(
-        self, starts: Iterable[Any], parameters: Iterable[Parameter]
-    ) -> Iterator[Friction]:
-        """Yield stick-slip friction along coordinates, over parameters."""
-        values = {p.symbol: p.value for p in parameters}
-        known = {name_of(one): self.map[one].name for one in starts}
-        friction = api_arguments.by_name(self.arguments.friction, "friction", "{x: mu*m*g}")
-        for name, size in friction.items():
-            role = f"friction of {name}"
-            if name not in known:
-                raise argument_error(role, f"coordinates are {', '.join(known)}")
-            force = self._expression(size, role)
-            if moving := sorted(s.name for s in force.free_symbols - self.fixed.keys()):
-                raise argument_error(role, f"{moving[0]} is no parameter, of which it is made")
-            if (value := float(force.xreplace(values))) < 0:
-                raise argument_error(role, f"is {value:g}, and can't be negative")
-            yield Friction(known[name], force, "friction")
 
-    def _outputs(
-        self, starts: Iterable[Any], coordinates: Sequence[Coordinate],
-        units: Mapping[Any, str], rows: Sequence[str],
-    ) -> Iterator[Output]:  # fmt: skip
-        """Yield the outputs, which may use accelerations and multipliers (lambda_rod)."""
-        outputs = self.arguments.outputs
-        for one, c in zip(starts, coordinates, strict=True):
-            if isinstance(one, AppliedUndef):
-                self.map[sympy.Derivative(one, (one.args[0], 2))] = c.qdd
-            else:
-                self.map[Symbol(f"{one}_ddot", **one.assumptions0)] = c.qdd
-            self.known.add(c.qdd)
-        for row in rows:
-            name, multiplier = symbol(f"lambda_{row}"), multiplier_of(row)
-            if name.name not in self.taken:
-                self.map |= {name: multiplier, Symbol(name.name): multiplier}
-                self.known |= {name, multiplier}
-        if not isinstance(outputs, Mapping):
-            raise argument_error(
-                "outputs", f'give a dict, such as {{"tip": x + l}}, here {outputs!r}'
-            )
-        moving = {x for c in coordinates for x in (c.q, c.qd)}
-        for name, formula in outputs.items():
-            called = api_arguments.valid_name(name, "outputs")
-            expr = self._expression(formula, f"output {name}")
-            if called in rows:
-                raise argument_error("outputs", f"'{name}' is a constraint already: rename one")
-            if expr in moving and is_in_degrees(units.get(name, "")):
-                raise argument_error(
-                    "outputs",
-                    f"{name}: angles are in radians, nothing is converted: give {formula}*180/pi",
-                )
-            yield Output(called, expr, units.get(name, ""))
+class _Printer(StrPrinter):  # type: ignore[misc]  # SymPy has no types
+    """Printer of SymPy expressions as formulas of scenes."""
 
-    def _declare(self, one: Any, role: str) -> str:
-        used = self._name_of(one, role)
-        self.map[one] = symbol(used)
-        if one == symbol(name_of(one)):  # also without the assumption of real values
-            self.map[Symbol(one.name)] = symbol(used)
-        return used
+    def _print_Function(self, expr: Any) -> str:
+        args = expr.args[:1] if isinstance(expr, sympy.Heaviside) else expr.args
+        return f"{_FORMULA_NAMES[type(expr)]}({self.stringify(args, ', ')})"
 
-    def _own_symbols(self, coordinates: Iterable[Any]) -> dict[str, Expr]:
-        """Return the user's symbols of coordinates, their derivatives, and all other quantities.
+    _print_Max = _print_Min = _print_Abs = _print_Heaviside = _print_Function
 
-        Names that were given as text have no symbol of the user. A velocity that has none in the
-        user's expressions is real where its coordinate is, and has either sign.
-        """
-        arguments = self.arguments
-        declarations = (
-            arguments.coordinates,
-            arguments.parameters,
-            arguments.inputs,
-            arguments.definitions,
-        )
-        as_text = {one for group in declarations for one in group if isinstance(one, str)}
-        moving, replacements = {*coordinates}, dict[str, Expr]()
-        for name, one in self.taken.items():
-            if name_of(one) in as_text:
-                continue
-            replacements[name] = one
-            if one in moving and isinstance(one, AppliedUndef):
-                (time,) = one.args
-                replacements["t"] = time
-                replacements[f"{name}_dot"], replacements[f"{name}_ddot"] = (
-                    one.diff(time),
-                    one.diff(time, 2),
-                )
-            elif one in moving:
-                for order in ("_dot", "_ddot"):
-                    rate = Symbol(f"{one}{order}", real=one.is_real)
-                    replacements[name + order] = self.used.get(rate.name, rate)
-        return replacements
+    def _print(self, expr: Any, **settings: Any) -> str:
+        """Print a long sum or product in parentheses, which limit the depth of the syntax tree."""
+        if not isinstance(expr, (sympy.Add, sympy.Mul)) or len(expr.args) <= _MOST_TERMS:
+            return str(super()._print(expr, **settings))
+        size = -(-len(expr.args) // _MOST_TERMS)
+        parts = (expr.args[k : k + size] for k in range(0, len(expr.args), size))
+        groups = (f"({self._print(expr.func(*part, evaluate=False))})" for part in parts)
+        return (" + " if expr.is_Add else "*").join(groups)
+
+    def _print_Float(self, expr: Any) -> str:
+        return repr(float(expr))
+
+    def _print_Exp1(self, expr: Any) -> str:
+        return "exp(1)"
+
+    def _print_NumberSymbol(self, expr: Any) -> str:
+        return repr(float(expr))
+
+    def _print_Pi(self, expr: Any) -> str:
+        return "pi"
+
+
+_FORMULA_NAMES = {function: name for name, function in algebra.CLASSES.items()}
+
+
+def as_formula(expr: Expr) -> Formula:
+    """Return a SymPy expression of real symbols as a formula, whose text is in the scenes' syntax.
+
+    >>> x = Symbol("x")
+    >>> as_formula(sympy.Abs(x) ** 2 / 2 + sympy.exp(1) * sympy.Max(x, 0)).text
+    'abs(x)**2/2 + exp(1)*max(0, x)'
+    """
+    text = str(_Printer().doprint(expr))
+    return Formula(text, ast.parse(text, mode="eval").body, expr)
 
 
 # --- functions that formulas of scenes have -------------------------------------------------------
@@ -570,21 +432,24 @@ _AS: Mapping[Any, Callable[[Expr], Expr]] = {
     sympy.sech: lambda x: 1 / sympy.cosh(x),
     sympy.csch: lambda x: 1 / sympy.sinh(x),
     sympy.coth: lambda x: 1 / sympy.tanh(x),
+    cfunctions.Cbrt: algebra.cbrt,
+    cfunctions.expm1: algebra.expm1,
+    cfunctions.hypot: algebra.hypot,
+    cfunctions.log1p: algebra.log1p,
+    cfunctions.exp2: lambda x: 2**x,
+    cfunctions.log2: lambda x: sympy.log(x) / sympy.log(2),
+    cfunctions.log10: lambda x: sympy.log(x) / sympy.log(10),
     sympy.asec: lambda x: sympy.acos(1 / x),
     sympy.acsc: lambda x: sympy.asin(1 / x),
 }
 _ORDERS = (GreaterThan, LessThan, StrictGreaterThan, StrictLessThan)
 
 
-class JumpError(ValueError):
-    """Error for a SymPy Piecewise that is discontinuous or whose continuity is undecided."""
-
-
 def rewrite_functions(expr: Expr, fixed: Mapping[Symbol, bool]) -> Expr:
     """Return an equal expression without Piecewise and without functions such as sec and coth.
 
     The result uses only functions that formulas of scenes can use. fixed: dict from each constant
-    symbol to True if it is known to be nonnegative, else False. Raises JumpError for a Piecewise
+    symbol to True if it is known to be nonnegative, else False. Raises FormulaError for a Piecewise
     that is discontinuous, or whose continuity cannot be decided.
     """
     expr = expr.replace(lambda e: type(e) in _AS, lambda e: _AS[type(e)](*e.args))
@@ -599,12 +464,12 @@ def _continuous(piecewise: sympy.Piecewise, fixed: Mapping[Symbol, bool]) -> Exp
     """
     *pieces, (result, last) = piecewise.args
     if last != sympy.true:
-        raise JumpError(f"{piecewise} has no last piece: give one for all else, (0, True)")
+        raise FormulaError(f"{piecewise} has no last piece: give one for all else, (0, True)")
     last_piece = result
     for k in reversed(range(len(pieces))):
         piece, condition = pieces[k]
         if not isinstance(condition, _ORDERS):
-            raise JumpError(f"{condition} in a Piecewise can't be used: write x > a or x < a")
+            raise FormulaError(f"{condition} in a Piecewise can't be used: write x > a or x < a")
         d = condition.gts - condition.lts
         other = _applicable_piece(condition, piecewise.args[k + 1 :], fixed)
         q = sympy.cancel((piece - other) / d) if other is not None else sympy.zoo
@@ -614,7 +479,7 @@ def _continuous(piecewise: sympy.Piecewise, fixed: Mapping[Symbol, bool]) -> Exp
             jump = sympy.Heaviside(d)
             if len(pieces) == 1:
                 jump = last_piece + (piece - last_piece) * jump
-            raise JumpError(
+            raise FormulaError(
                 f"{piecewise} jumps where {d} = 0, or can't be seen not to: write {jump}, whose "
                 f"Heaviside is 1/2 there, or Max, Min or a smooth tanh{order}"
             )
@@ -644,146 +509,3 @@ def _are_exclusive(one: Any, other: Any, fixed: Mapping[Symbol, bool]) -> bool:
         if s.is_positive and sympy.expand(d + s * e).xreplace(known).is_nonpositive:
             return True
     return bool(sympy.And(one, other).simplify() == sympy.false)
-
-
-# --- pictures -------------------------------------------------------------------------------------
-
-_PICTURE_EXAMPLE = (
-    '{"points": {"tip": ["l*sin(theta)", "-l*cos(theta)"]}, "lines": [[[0, 0], "tip"]]}'
-)
-_WORDS = (  # phrases of messages, for TOML and for Python
-    ('lines = [["cart", "tip"]]', '"lines": [["cart", "tip"]]'),
-    ("[picture.points], such as tip = [", '"points", such as "tip": ['),
-    (
-        'a table, such as { tip = ["x", "l*cos(theta)"] }',
-        'a dict, such as {"tip": ["x", "l*cos(theta)"]}',
-    ),
-    ("a list of tables with", "a list of dicts with"),
-    ('[{ at = "cart", size = [0.4, 0.2] }]', '[{"at": "cart", "size": [0.4, 0.2]}]'),
-    ('[{ at = "wheel", radius = 0.1 }]', '[{"at": "wheel", "radius": 0.1}]'),
-    (", here a table", ", here a dict"),
-    (", here true", ", here True"),
-    (", here false", ", here False"),
-)
-_SCENE_NAMES = {"Abs": "abs", "Max": "max", "Min": "min"}
-
-
-def picture_scene(
-    picture: Any, expression: Callable[[Any, str], Expr], coordinates: Iterable[Coordinate],
-    parameters: Iterable[Parameter], inputs: Iterable[str],
-    definitions: Sequence[tuple[Symbol, Expr]],
-) -> tuple[Scene, str]:  # fmt: skip
-    """Return a scene with the picture of a system made in Python, and the picture as JSON text.
-
-    Parameters
-    ----------
-    picture
-        The argument `picture` of System.make.
-    expression
-        Function that converts a user's expression; called with (expression, description of it for
-        messages).
-    coordinates, parameters, inputs
-        Quantities that the picture may use; the scene declares all of them.
-    definitions
-        Pairs (symbol, expression) that the picture may use; the scene contains those that it needs.
-
-    Raises
-    ------
-    EomcError
-        If the picture is invalid.
-    """
-    if not isinstance(picture, Mapping):
-        raise argument_error(
-            "picture", f"give a dict, such as {_PICTURE_EXAMPLE}, here {picture!r}"
-        )
-    table = _as_toml(picture, expression)
-    coordinates = [*coordinates]
-    tree: dict[str, Any] = {
-        "eomc": 1,
-        "name": "pictured",
-        "coordinates": {c.name: _metres(c) for c in coordinates},
-        "parameters": {p.name: {"value": p.value, **_metres(p)} for p in parameters},
-        "inputs": {name: {} for name in inputs},
-        "definitions": _used_definitions(table, definitions),
-        "energy": {"kinetic": f"{coordinates[0].name}_dot**2"},  # required in a scene; not drawn
-        "picture": table,
-    }
-    try:
-        scene = read.check_tree(tree, "System.make")
-    except SceneError as wrong:
-        problems = [replace(p, message=message_in_python(p.message)) for p in wrong.problems]
-        raise SceneError(problems) from None
-    return scene, json.dumps(table, sort_keys=True, default=str)
-
-
-def message_in_python(message: str) -> str:
-    """Return a message about the table [picture] with Python syntax in place of TOML syntax."""
-    for toml, python in _WORDS:
-        message = message.replace(toml, python)
-    return message
-
-
-def _metres(one: Coordinate | Parameter) -> dict[str, str]:
-    """Return the unit if it is a length, the only one that pictures use."""
-    return {"unit": "m"} if one.unit == "m" else {}
-
-
-def _as_toml(value: Any, expression: Callable[[Any, str], Expr]) -> Any:
-    """Convert a value to that of a scene: expressions to formulas, sequences to lists."""
-    if isinstance(value, Mapping):
-        return {str(key): _as_toml(entry, expression) for key, entry in value.items()}
-    if isinstance(value, sympy.MatrixBase):
-        value = value.flat()
-    if hasattr(value, "tolist"):  # NumPy's
-        value = value.tolist()
-    if isinstance(value, (list, tuple)):
-        return [_as_toml(entry, expression) for entry in value]
-    if isinstance(value, Expr):
-        return formula_text(expression(value, "picture"))
-    return value
-
-
-def _used_definitions(table: Any, definitions: Sequence[tuple[Symbol, Expr]]) -> dict[str, str]:
-    """Return the definitions on which a picture depends, in their order."""
-    names = {*re.findall(r"[A-Za-z_]\w*", json.dumps(table, default=str))}
-    used: dict[str, str] = {}
-    for name, expr in reversed(definitions):
-        if name.name in names:
-            names |= {s.name for s in expr.free_symbols if isinstance(s, Symbol)}
-            used[name.name] = formula_text(expr)
-    return dict(reversed(used.items()))
-
-
-class _Formula(StrPrinter):  # type: ignore[misc]  # SymPy has no types
-    """Printer of SymPy expressions as formulas of scenes."""
-
-    def _print_Function(self, expr: Any) -> str:
-        name = type(expr).__name__
-        return f"{_SCENE_NAMES.get(name, name)}({self.stringify(expr.args, ', ')})"
-
-    _print_Max = _print_Min = _print_Abs = _print_Function
-
-    def _print_Heaviside(self, expr: Any) -> str:
-        return f"heaviside({self._print(expr.args[0])})"
-
-    def _print_Float(self, expr: Any) -> str:
-        return repr(float(expr))
-
-    def _print_Exp1(self, expr: Any) -> str:
-        return "exp(1)"
-
-    def _print_NumberSymbol(self, expr: Any) -> str:
-        return repr(float(expr))
-
-    def _print_Pi(self, expr: Any) -> str:
-        return "pi"
-
-
-def formula_text(expr: Expr) -> str:
-    """Return a SymPy expression as a formula in the syntax of scenes.
-
-    >>> x = Symbol("x")
-    >>> formula_text(sympy.Abs(x) ** 2 / 2 + sympy.exp(1) * sympy.Max(x, 0))
-    'abs(x)**2/2 + exp(1)*max(0, x)'
-    """
-    return str(_Formula().doprint(expr))

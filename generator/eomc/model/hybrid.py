@@ -17,7 +17,7 @@ which vanishes at dead points, where friction cannot prevent slip. Forces are sm
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import sympy
@@ -143,39 +143,69 @@ def add_discrete_coordinates(system: AnySystem) -> AnySystem:
     jumped_parameters = [p for p in system.parameters if p.name in jumped]
     if not jumped_parameters:
         return system
+    velocities = (
+        (f"parameters.{p.name}", f"{p.name}{end}", "a jump sets it, which")
+        for p in jumped_parameters
+        for end in ("_dot", "_ddot")
+    )
     if (
-        problems := _names_taken_by_velocities(system, jumped_parameters)
+        problems := _report_taken_names(system, velocities)
         + _inputs_with_jumped_limits(system, jumped_parameters)
         + _events_without_motion(system, jumped_parameters)
     ):
         raise SceneError(problems)
     variables = tuple(Coordinate(p.name, p.unit, p.value, note=p.note) for p in jumped_parameters)
-    energy = sum(c.qd**2 for c in variables) / 2
+    return replace(
+        _with_coordinates(system, variables),
+        parameters=tuple(p for p in system.parameters if p not in jumped_parameters),
+        discrete=tuple(p.name for p in jumped_parameters),
+    )
+
+
+def _with_coordinates(system: AnySystem, variables: Sequence[Coordinate]) -> AnySystem:
+    """Return a copy of a system with further, discrete coordinates, on which no force acts."""
+    energy = sympy.Add(*(c.qd**2 / 2 for c in variables))
     tree = system.tree and replace(system.tree, other_kinetic=system.tree.other_kinetic + energy)
+    forces = system.forces or [S.Zero] * len(system.coordinates)
     return replace(
         system,
         coordinates=(*system.coordinates, *variables),
         kinetic=system.kinetic + energy,
-        forces=system.forces and (*system.forces, *[0 * energy] * len(variables)),
-        parameters=tuple(p for p in system.parameters if p not in jumped_parameters),
-        discrete=tuple(p.name for p in jumped_parameters),
+        forces=(*forces, *[S.Zero] * len(variables)),
         tree=tree,
     )
 
 
-def _names_taken_by_velocities(
-    system: Mechanics, jumped_parameters: list[Parameter]
+def _without_coordinates(system: AnySystem, names: Collection[str]) -> AnySystem:
+    """Return a copy of a system without some discrete coordinates and without any events."""
+    energy = sympy.Add(*(c.qd**2 / 2 for c in system.coordinates if c.name in names))
+    tree = system.tree and replace(system.tree, other_kinetic=system.tree.other_kinetic - energy)
+    pairs = zip(system.coordinates, system.forces or (), strict=False)
+    return replace(
+        system,
+        coordinates=tuple(c for c in system.coordinates if c.name not in names),
+        kinetic=system.kinetic - energy,
+        forces=tuple(force for c, force in pairs if c.name not in names),
+        events=(),
+        tree=tree,
+    )
+
+
+def _report_taken_names(
+    system: Mechanics, requests: Iterable[tuple[str, str, str]]
 ) -> list[Problem]:
-    """Report names of the scene that coincide with velocities of discrete variables."""
-    known = {*system.names, *(s.name for s, _ in system.definitions)}
-    known |= {o.name for o in system.outputs}
+    """Report names that are needed, but that the scene has already.
+
+    requests: tuples (key in the scene, name, what needs the name).
+    """
+    taken = {
+        *system.names, *(s.name for s, _ in system.definitions), *(o.name for o in system.outputs),
+        *(r.name for r in system.constraints), *(e.name for e in system.events),
+    }  # fmt: skip
     return [
-        system.problem(
-            f"parameters.{p.name}", f"a jump sets it, which needs the name '{name}': rename yours"
-        )
-        for p in jumped_parameters
-        for name in (f"{p.name}_dot", f"{p.name}_ddot")
-        if name in known
+        system.problem(key, f"{what} needs the name '{name}': rename yours")
+        for key, name, what in requests
+        if name in taken
     ]
 
 
@@ -222,39 +252,12 @@ def with_constant_parameters(system: AnySystem) -> AnySystem:
     """
     if not system.discrete:
         return system
-    own = [c for c in system.coordinates if c.name not in system.discrete]
-    variables = [c for c in system.coordinates if c.name in system.discrete]
-    energy = sum(c.qd**2 for c in variables) / 2
-    tree = system.tree and replace(system.tree, other_kinetic=system.tree.other_kinetic - energy)
-    forces = zip(system.coordinates, system.forces or (), strict=False)
+    variables = (c for c in system.coordinates if c.name in system.discrete)
+    parameters = (Parameter(c.name, c.start, c.unit, c.note) for c in variables)
     return replace(
-        system,
-        coordinates=tuple(own),
-        kinetic=system.kinetic - energy,
-        forces=tuple(force for c, force in forces if c.name not in system.discrete),
-        parameters=(
-            *system.parameters,
-            *(Parameter(c.name, c.start, c.unit, c.note) for c in variables),
-        ),
+        _without_coordinates(system, system.discrete),
+        parameters=(*system.parameters, *parameters),
         discrete=(),
-        events=(),
-        tree=tree,
-    )
-
-
-def with_parameters_as_states(system: AnySystem, core: AnySystem) -> AnySystem:
-    """Return a copy of a system with discrete coordinates that has the initial values of `core`.
-
-    core: the result of `with_constant_parameters` for the system, after its initial values were
-    adjusted to its constraints. The copy also has the constraints of `core` and their summary.
-    """
-    variables = [c for c in system.coordinates if c.name in system.discrete]
-    return replace(
-        system,
-        coordinates=(*core.coordinates, *variables),
-        constraints=core.constraints,
-        closure=core.closure,
-        warnings=core.warnings,
     )
 
 
@@ -274,18 +277,21 @@ def add_stick_slip(system: AnySystem, frictions: Sequence[Friction]) -> AnySyste
     if not frictions:
         return system
     forces_by_name: dict[str, Expr] = {}
-    for friction in frictions:
-        forces_by_name[friction.coordinate] = (
-            forces_by_name.get(friction.coordinate, S.Zero) + friction.force
-        )
-    if taken := _names_taken_by_modes(system, forces_by_name):
+    for f in frictions:
+        forces_by_name[f.coordinate] = forces_by_name.get(f.coordinate, S.Zero) + f.force
+    names = (
+        ("run.friction", f"{name}_{word}", '"stick"')
+        for name in forces_by_name
+        for word in ("slides", "slides_dot", "sticks", "stops", "slips")
+    )
+    if taken := _report_taken_names(system, names):
         raise SceneError(taken)
     index = {c.name: k for k, c in enumerate(system.coordinates)}
     modes = tuple(
         FrictionMode(len(index) + n, index[name]) for n, name in enumerate(forces_by_name)
     )
-    forces = [*(system.forces or [S.Zero] * len(index)), *[S.Zero] * len(modes)]
-    states, rows, events, energy = [], [], [], S.Zero
+    sliding_forces: dict[int, Expr] = {}
+    states, rows, events = [], [], []
     sliding: dict[str, str] = {}  # friction mode of each velocity
     for (name, force), mode in zip(forces_by_name.items(), modes, strict=True):
         c = system.coordinates[mode.of]
@@ -297,42 +303,23 @@ def add_stick_slip(system: AnySystem, frictions: Sequence[Friction]) -> AnySyste
             note=f"what holds {name} where it sticks",
             switched=True,
         )
-        forces[mode.of] -= force * s.q
-        energy += s.qd**2 / 2
+        sliding_forces[mode.of] = -force * s.q
         states.append(s)
         rows.append(row)
         events += _transitions(c, s, force, row)
         sliding[c.qd.name] = s.name
-    tree = system.tree and replace(system.tree, other_kinetic=system.tree.other_kinetic + energy)
+    whole = _with_coordinates(system, states)
     return replace(
-        system,
-        coordinates=(*system.coordinates, *states),
-        kinetic=system.kinetic + energy,
-        forces=tuple(forces),
+        whole,
+        forces=tuple(f + sliding_forces.get(k, S.Zero) for k, f in enumerate(whole.forces)),
         constraints=(*system.constraints, *rows),
         events=(*(_set_modes(e, sliding) for e in system.events), *events),
-        tree=tree,
         modes=modes,
     )
 
 
 def _side(rate: float) -> float:
     return float((rate > 0) - (rate < 0))
-
-
-def _names_taken_by_modes(system: Mechanics, forces_by_name: Iterable[str]) -> list[Problem]:
-    """Report names of the scene that coincide with names of modes."""
-    known = {
-        *system.names, *(s.name for s, _ in system.definitions), *(o.name for o in system.outputs),
-        *(r.name for r in system.constraints), *(e.name for e in system.events),
-    }  # fmt: skip
-    words = ("slides", "slides_dot", "sticks", "stops", "slips")
-    return [
-        system.problem("run.friction", f"\"stick\" needs the name '{name}_{word}': rename yours")
-        for name in forces_by_name
-        for word in words
-        if f"{name}_{word}" in known
-    ]
 
 
 def _transitions(c: Coordinate, s: Coordinate, force: Expr, row: Constraint) -> list[Event]:
@@ -362,50 +349,44 @@ def without_modes(system: AnySystem) -> AnySystem:
     """Return a copy of a system without stick-slip friction and without any events.
 
     The coordinates and constraints that `add_stick_slip` added are removed. With this copy,
-    initial values are computed that satisfy all other constraints; `with_modes` then transfers
-    them to the original system.
+    initial values are computed that satisfy all other constraints; `with_discrete_coordinates` then
+    transfers them to the original system.
     """
-    n, m = len(system.coordinates) - len(system.modes), len(system.constraints) - len(system.modes)
-    energy = sympy.Add(*(c.qd**2 / 2 for c in system.coordinates[n:]))
-    sticking = dict.fromkeys((c.q for c in system.coordinates[n:]), S.Zero)
-    tree = system.tree and replace(system.tree, other_kinetic=system.tree.other_kinetic - energy)
+    modes = [system.coordinates[mode.at] for mode in system.modes]
+    sticking = {c.q: S.Zero for c in modes}
+    core = _without_coordinates(system, [c.name for c in modes])
     return replace(
-        system,
-        coordinates=system.coordinates[:n],
-        kinetic=system.kinetic - energy,
-        forces=tuple(force.xreplace(sticking) for force in system.forces[:n]),
-        events=(),
-        constraints=system.constraints[:m],
-        tree=tree,
+        core,
+        forces=tuple(force.xreplace(sticking) for force in core.forces),
+        constraints=system.constraints[: len(system.constraints) - len(modes)],
         modes=(),
         closure=None,
     )
 
 
-def with_modes(system: AnySystem, core: AnySystem) -> AnySystem:
-    """Return a copy of a system with stick-slip friction that has the initial values of `core`.
+def with_discrete_coordinates(system: AnySystem, core: AnySystem) -> AnySystem:
+    """Return a copy of a system with discrete coordinates that has the initial values of `core`.
 
-    core: the result of `without_modes` for the system, after its initial values were adjusted to
-    its constraints. The copy also has the constraints of `core` and their summary. The initial
-    friction modes are computed from the initial velocities.
+    core: the result of `without_modes` or `with_constant_parameters` for the system, after its
+    initial values were adjusted to its constraints. The copy also has the constraints of `core` and
+    their summary. The initial friction modes are computed from the initial velocities.
     """
-    modes = [
-        replace(system.coordinates[m.at], start=_side(core.coordinates[m.of].rate))
-        for m in system.modes
-    ]
-    own = system.constraints[len(core.constraints) :]
+    coordinates = [*core.coordinates, *system.coordinates[len(core.coordinates) :]]
+    for m in system.modes:
+        coordinates[m.at] = replace(coordinates[m.at], start=_side(coordinates[m.of].rate))
+    own, count = system.constraints[len(core.constraints) :], len(system.modes)
     summary = core.closure or ConstraintSummary((), len(core.rates), 0)
     closure = replace(
         summary,
         rows=(*summary.rows, *(row.name for row in own)),
-        coordinates=summary.coordinates + len(modes),
+        coordinates=summary.coordinates + count,
         rank=summary.rank + len(own),
         weights=(*summary.weights, *[0.0] * len(own)) if summary.weights else (),
         slopes=(*summary.slopes, *[0.0] * len(own)),
     )
     return replace(
         system,
-        coordinates=(*core.coordinates, *modes),
+        coordinates=tuple(coordinates),
         constraints=(*core.constraints, *own),
         closure=closure,
         warnings=core.warnings,

@@ -5,18 +5,18 @@ Independent of the source of the system, TOML or Python, and of the generated C.
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import groupby
 from typing import Any, Self, TypeVar
 
 import sympy
-from sympy import Expr, Symbol
+from sympy import Dummy, Expr, S, Symbol
 
 from eomc.base.errors import Problem
 from eomc.base.texts import listed, plural
+from eomc.model.algebra import classes_of_shape
 from eomc.model.symbols import (
     Constraint,
     Coordinate,
@@ -26,9 +26,13 @@ from eomc.model.symbols import (
     Output,
     Parameter,
     Reaction,
+    dot,
+    needed_definitions,
 )
 from eomc.model.tree import BodyFrame, Tree
-from eomc.scene.scene import RunSettings, Scene
+from eomc.scene.scene import Scene
+from eomc.scene.schema import RunSettings
+from eomc.scene.toml_text import ArgumentMap
 
 
 @dataclass(frozen=True)
@@ -156,31 +160,6 @@ class ConstraintSummary:
 LEAST_FLOAT, LARGEST_FLOAT = 2.0**-126, 2.0**128 - 2.0**104  # of C's float, in full precision
 
 
-_TABLES = "constants constraints coordinates definitions energy forces inputs outputs parameters"
-_TABLE = re.compile(rf"\[({_TABLES.replace(' ', '|')})\]")
-
-
-def with_argument_names(message: str) -> str:
-    """Replace the names of TOML tables in a message by the corresponding arguments of System.make.
-
-    >>> with_argument_names("split it with [definitions]")
-    'split it with definitions'
-    """
-    return _TABLE.sub(r"\1", message)
-
-
-def argument_name(key: str) -> str:
-    """Return the argument of System.make that corresponds to a key of a scene.
-
-    >>> argument_name("run.method"), argument_name("energy.kinetic"), argument_name("parameters.m")
-    ('methods', 'kinetic', 'parameters.m')
-    """
-    table, _, last = key.partition(".")
-    if table not in ("run", "energy") or not last:
-        return key
-    return {"method": "methods"}.get(last, last)
-
-
 @dataclass(frozen=True)
 class Mechanics:
     """A mechanical system in symbols: d/dt dL/dqd - dL/dq + dR/dqd = Q with L = K - P - a.qd.
@@ -195,7 +174,7 @@ class Mechanics:
         Kinetic energy K, potential energy P and Rayleigh's dissipation function R.
     linear_potential
         The part a(q, t).qd of a generalized potential, which is not part of the energy
-        (generalized_potential.py).
+        (py).
     forces
         Generalized forces Q, one for each coordinate.
     applied
@@ -218,11 +197,11 @@ class Mechanics:
     renamed
         Names that C does not allow, as pairs (given name, name in the system).
     place
-        Function that returns a Problem at a key of the scene; None for a system made in Python.
+        Function that returns a Problem at a key of the scene.
+    file
+        Name of the scene file; "" for a system made in Python.
     scene
-        The scene from which the system was read, if any.
-    picture_scene
-        For a system made in Python with a picture, a scene with its names and picture only.
+        The checked scene.
     closure
         Summary of the constraints, once the initial values are consistent with them.
     modes
@@ -264,7 +243,6 @@ class Mechanics:
     warnings: tuple[Problem, ...] = field(default=(), compare=False)
     place: Callable[..., Problem] | None = field(default=None, compare=False, repr=False)
     scene: Scene | None = field(default=None, compare=False, repr=False)
-    picture_scene: Scene | None = field(default=None, compare=False, repr=False)
     closure: ConstraintSummary | None = field(default=None, compare=False, repr=False)
     modes: tuple[FrictionMode, ...] = ()
     discrete: tuple[str, ...] = ()
@@ -327,8 +305,8 @@ class Mechanics:
         "note". The result contains file and line if the system was read from a scene.
         """
         if self.place is None:
-            message, key = with_argument_names(message), argument_name(key)
-            return Problem(message, key, f"System {self.name}", severity=severity)
+            places = ArgumentMap(self.name)
+            return places.problem(tuple(key.split(".")), message, severity=severity)
         return self.place(key, message, severity=severity)
 
     def with_parameters(self, parameters: Mapping[str, float]) -> Self:
@@ -417,3 +395,136 @@ class Mechanics:
 
 # type of functions that return a changed system of the same class
 AnySystem = TypeVar("AnySystem", bound=Mechanics)
+
+
+# --- functions that are not smooth, and smooth ones that may be steep relative to a step ----------
+
+KINDS = classes_of_shape("corner", "jump")
+STEEP = classes_of_shape("corner", "jump", "steep")  # tanh acts as a jump if it is narrow
+
+
+def nonsmooth_functions(system: Mechanics, kinds: tuple[Any, ...] = KINDS) -> str:
+    """Return text that lists the non-smooth functions, such as abs, in a system's expressions.
+
+    The names are separated by commas; the text is "" if there are none. kinds: SymPy classes of the
+    functions to look for.
+    """
+    s = system
+    exprs = (
+        *(s.kinetic, s.potential, s.linear_potential, s.dissipation, *s.forces),
+        *(e for x in s.applied for e in x),
+        *(e for _, e in s.definitions),
+        *(i.signal for i in s.inputs),
+        *(c.formula for c in s.constraints if not c.switched),
+    )
+    names = {atom.func.__name__.lower() for e in exprs for atom in e.atoms(*kinds)}
+    return ", ".join(sorted(names))
+
+
+def has_steep_terms(system: Mechanics) -> bool:
+    """Return True if the expressions of a system are non-smooth or may vary fast within one step.
+
+    Functions that may vary fast are tanh, atan and erf of any argument, and functions of the
+    velocities other than polynomials, sines and cosines, such as friction smoothed by
+    v/sqrt(v**2 + w**2) or the Stribeck term exp(-v**2).
+    """
+    if nonsmooth_functions(system, STEEP):
+        return True
+    s, fast = system, set(system.qd)
+    for name, e in s.definitions:
+        if e.free_symbols & fast or e.has(dot):
+            fast.add(name)
+    exprs = (
+        s.dissipation, *s.forces, *(f for _, f in s.applied), *(e for _, e in s.definitions),
+        *(i.signal for i in s.inputs),
+    )  # fmt: skip
+    return any(
+        (f.free_symbols & fast or f.has(dot)) and not _is_gentle(f)
+        for e in exprs
+        for f in e.atoms(sympy.Function, sympy.Pow)
+    )
+
+
+def _is_gentle(f: sympy.Expr) -> bool:
+    natural_power = f.is_Pow and f.exp.is_Integer and f.exp > 0
+    return bool(natural_power or isinstance(f, (dot, sympy.sin, sympy.cos)))
+
+
+# --- generalized potentials -----------------------------------------------------------------------
+
+# U(q, qd, t) = P(q, t) + a(q, t).qd, such as that of a magnetic field. The generalized force is
+# Q = d/dt dU/dqd - dU/dq (Goldstein, Poole & Safko, *Classical Mechanics*, sec. 1.5), so that
+# L = K - U. The linear part does no work: where K is quadratic in the velocities,
+# qd.dL/dqd - L = K + P, without a.qd.
+
+NOT_LINEAR = (
+    "the potential energy can contain velocities in linear terms only, such as those of a magnetic "
+    "field: inertia belongs in 'kinetic', friction in 'dissipation'"
+)
+
+
+class NotLinearError(ValueError):
+    """Error for a potential energy that is nonlinear in the velocities."""
+
+
+def split_potential(
+    potential: Expr, definitions: Sequence[tuple[Symbol, Expr]], velocities: Iterable[Symbol]
+) -> tuple[Expr, Expr]:
+    """Split a generalized potential U = P(q, t) + a(q, t).qd and return the pair (P, a.qd).
+
+    A time derivative dot(y) in U counts as a velocity and is not expanded. A term with dot(y)
+    therefore belongs to a.qd even if y depends on t explicitly. Symbols whose definitions contain
+    velocities are replaced by their expressions.
+
+    Parameters
+    ----------
+    potential
+        The generalized potential U.
+    definitions
+        Pairs (symbol, expression), each expression over the symbols before it.
+    velocities
+        Symbols of the generalized velocities.
+
+    Raises
+    ------
+    NotLinearError
+        If U is nonlinear in the velocities.
+    """
+    moving = {*velocities}
+    for name, e in definitions:
+        if e.free_symbols & moving or e.has(dot):
+            moving.add(name)
+
+    def moves(e: Expr) -> bool:
+        return bool(e.free_symbols & moving or e.has(dot))
+
+    terms = sympy.Add.make_args(potential)
+    conservative = sympy.Add(*(e for e in terms if not moves(e)))
+    rest = sympy.Add(*filter(moves, terms))
+    if rest == 0:
+        return potential, S.Zero
+    known: dict[Expr, Expr] = {}
+    for name, e in needed_definitions(definitions, [rest]):
+        if name in moving:
+            known[name] = e.xreplace(known)
+    rest = rest.xreplace(known)
+    rates = sorted(rest.atoms(dot), key=str)
+    outer = [e for e in rates if not any(other != e and other.has(e) for other in rates)]
+    stand_ins: dict[Expr, Expr] = {e: Dummy(real=True) for e in outer}
+    rest = rest.xreplace(stand_ins)
+    variables = [*(rest.free_symbols & {*velocities}), *stand_ins.values()]
+    variables.sort(key=str)
+    at_rest = dict.fromkeys(variables, S.Zero)
+    slopes = [_eliminate_variables(sympy.diff(rest, x), variables) for x in variables]
+    linear = sympy.Add(*(a * x for a, x in zip(slopes, variables, strict=True)))
+    back = {dummy: e for e, dummy in stand_ins.items()}
+    return conservative + rest.xreplace(at_rest), linear.xreplace(back)
+
+
+def _eliminate_variables(slope: Expr, variables: Sequence[Expr]) -> Expr:
+    """Return a derivative in a form without the variables. Raises NotLinearError if impossible."""
+    for attempt in (lambda e: e, sympy.expand, sympy.simplify):
+        slope = attempt(slope)
+        if not slope.has(*variables):
+            return slope
+    raise NotLinearError(NOT_LINEAR)

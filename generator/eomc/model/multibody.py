@@ -15,15 +15,31 @@ from sympy import Add, Expr, S, Symbol
 
 from eomc.base import spatial
 from eomc.base.spatial import apply, plus, product, scaled, transposed
-from eomc.model import loops, rational
+from eomc.model.constraints import End, LoopEquations, derive_gear_equation, derive_loop_equations
 from eomc.model.hybrid import Friction
-from eomc.model.loops import LoopEquations
-from eomc.model.rational import ONE, ZERO, Matrix, Vector, rounded_number, rounded_vector
 from eomc.model.symbols import dot, symbol
-from eomc.model.tree import BodyFrame, Chains, Link, Named, Step, Tree, rotation_about
-from eomc.scene.assembly import WORLD, Assembly, Damper, Force, LoopJoint, RigidBody, Spring
+from eomc.model.tree import (
+    ONE,
+    ZERO,
+    BodyFrame,
+    Chains,
+    Link,
+    Matrix,
+    Named,
+    Step,
+    Tree,
+    Vector,
+    aligned_with,
+    rotation_about,
+    rotation_about_vector,
+    rounded_matrix,
+    rounded_number,
+    rounded_vector,
+    unit_vector,
+)
 from eomc.scene.formulas import Formula
-from eomc.scene.joints import JOINTS
+from eomc.scene.joints import JOINTS, MotionSubspace
+from eomc.scene.scene import WORLD, Assembly, Damper, Force, LoopJoint, RigidBody, Spring
 
 Value = Callable[[str, Formula], Expr]  # (key in the scene, formula) -> SymPy expression
 
@@ -173,20 +189,20 @@ class Builder:
         place = _Place(
             parent.link,
             plus(parent.offset, apply(parent.rotation, rounded_vector(offset))),
-            rational.rounded_matrix(product(parent.rotation, rational.rounded_matrix(rotation))),
+            rounded_matrix(product(parent.rotation, rounded_matrix(rotation))),
             at,
             R,
             angle,
         )
         armature = [self.value(f"{key}.armature", a) for a in body.armature]
-        kind, by = JOINTS[body.joint], [self._coordinate(key, c) for c in body.coordinates]
-        for k, along in enumerate(zip(kind.motions, kind.motion_axes(body.axes), by, strict=True)):
+        pitch = self.value(f"{key}.pitch", body.pitch) if body.pitch else S.Zero
+        subspaces = JOINTS[body.joint].subspaces(body.axes, pitch)
+        by = [self._coordinate(key, c) for c in body.coordinates]
+        for k, motion in enumerate(zip(subspaces, by, strict=True)):
             place = self._add_elementary_joint(
-                body.name, place, *along, armature[k] if armature else S.Zero
+                body.name, place, *motion, armature[k] if armature else S.Zero
             )
-        moved = zip(
-            kind.motions, kind.motion_axes(body.axes), self.moved.get(body.name, ()), strict=True
-        )
+        moved = zip(subspaces, self.moved.get(body.name, ()), strict=True)
         turned = sum((self.value(f"{key}.rotation", x.angle) for x in body.rotation), S.Zero)
         self.chains.steps[body.name] = Step(body.parent, offset, rotation, turned, tuple(moved))
         if not self.assembly.plane and body.joint != "fixed":
@@ -203,34 +219,31 @@ class Builder:
         return moved
 
     def _add_elementary_joint(
-        self, name: str, place: _Place, motion: str, axis: Sequence[float], moved: Expr,
-        armature: Expr,
-    ) -> _Place:  # fmt: skip
+        self, name: str, place: _Place, motion: MotionSubspace, moved: Expr, armature: Expr
+    ) -> _Place:
         """Return the pose after one more elementary joint, which becomes a link."""
         terms = self.terms
         q = self._define(f"{name}_q", moved)
         self.moved.setdefault(name, []).append(q)
         terms.tree_kinetic.append(armature * self.terms.rates.get(q, _rate(q)) ** 2 / 2)
-        k, aligned = rational.aligned_with(axis)
-        direction = tuple(S(x) for x in rational.unit_vector(axis))
-        rotation = rational.rounded_matrix(product(place.rotation, aligned))
+        axis, angular, linear = motion
+        k, aligned = aligned_with(axis)
+        rotation = rounded_matrix(product(place.rotation, aligned))
         terms.links.append(
             Link(
-                name, place.link, motion == "r", k, moved, place.offset, rotation, armature=armature
+                name, place.link, k, S(angular), S(linear), moved, place.offset, rotation,
+                armature=armature,
             )
-        )
-        back = transposed(aligned)
-        if motion == "t":
-            way = scaled(apply(place.R, direction), q)
-            at = self._define_position(f"{name}_joint", plus(place.at, way))
-            return _Place(len(terms.links) - 1, ZERO, back, at, place.R, place.angle)
-        if self.assembly.plane:
-            angle = self._define(f"{name}_angle", place.angle + q)
+        )  # fmt: skip
+        way = scaled(apply(place.R, unit_vector(axis)), S(linear) * q)
+        at = self._define_position(f"{name}_joint", plus(place.at, way))
+        R, angle = place.R, place.angle
+        if angular and self.assembly.plane:
+            angle = self._define(f"{name}_angle", angle + q)
             R = rotation_about(2, angle)
-            return _Place(len(terms.links) - 1, ZERO, back, place.at, R, angle)
-        turn = product(product(aligned, rotation_about(k, q)), back)
-        R = self._define_matrix(name, product(place.R, turn))
-        return _Place(len(terms.links) - 1, ZERO, back, place.at, R)
+        elif angular:
+            R = self._define_matrix(name, product(R, rotation_about_vector(axis, q)))
+        return _Place(len(terms.links) - 1, ZERO, transposed(aligned), at, R, angle)
 
     def _add_mass(self, body: RigidBody, place: _Place) -> None:
         """Add the body's mass to its link and to the energies."""
@@ -255,8 +268,8 @@ class Builder:
                 moment=plus(link.moment, moment),
                 inertia=tuple(a + b for a, b in zip(link.inertia, about, strict=True)),
             )
-            terms.tree_kinetic += self._kinetic_terms(mass, inertia, position, place)
-        terms.tree_potential.append(self._gravity_potential(mass, position))
+            terms.tree_kinetic += self.kinetic_terms(mass, inertia, position, place)
+        terms.tree_potential.append(self.gravity_potential(mass, position))
 
     def add_forces(self) -> None:
         """Add the damping, friction and actuator forces of the joints to `terms`."""
@@ -298,7 +311,7 @@ class Builder:
         for k, spring in enumerate(self.assembly.springs):
             self._add_spring(f"spring.{k + 1}", spring)
         for k, damper in enumerate(self.assembly.dampers):
-            self._add_damper(f"damper.{k + 1}", damper)
+            self.add_damper(f"damper.{k + 1}", damper)
         for k, force in enumerate(self.assembly.forces):
             self._add_force(f"force.{k + 1}", force)
         for loop in self.assembly.loops:
@@ -331,18 +344,18 @@ class Builder:
         """Add a joint that closes a loop, or a gear."""
         if loop.ratio and loop.offset:
             ratio = self.value(f"{key}.ratio", loop.ratio)
-            return loops.derive_gear_equation(loop, ratio, self.value(f"{key}.offset", loop.offset))
+            return derive_gear_equation(loop, ratio, self.value(f"{key}.offset", loop.offset))
         ends, base = [], self.chains.common(*loop.bodies)
         for name, position in zip(loop.bodies, loop.points, strict=True):
             place, point = self.places[name], self._vector(f"{key}.points", position)
             at, R = place.at, place.R
             if base != WORLD:
                 at, R = self.chains.relative_pose(name, base, self._pose_definer(f"{loop.name}_"))
-            ends.append(loops.End(plus(at, apply(R, point)), R))
+            ends.append(End(plus(at, apply(R, point)), R))
         length = self.value(f"{key}.length", loop.length) if loop.length else S.Zero
         turned = self._rotation(f"{key}.rotation", loop)
         R = self.places[base].R
-        return loops.derive_loop_equations(
+        return derive_loop_equations(
             loop, self.assembly.plane, (ends[0], ends[1]), turned, length, R
         )
 
@@ -363,19 +376,20 @@ class Builder:
         place = _Place(-1, ZERO, ONE, position, R, angle)
         self.places[body.name] = place
         self.loads[body.name] = mass, tuple(inertia)
-        terms.kinetic += Add(*self._kinetic_terms(mass, inertia, position, place))
-        terms.potential += self._gravity_potential(mass, position)
+        terms.kinetic += Add(*self.kinetic_terms(mass, inertia, position, place))
+        terms.potential += self.gravity_potential(mass, position)
 
     def _add_spring(self, key: str, spring: Spring) -> None:
         stiffness = self.value(f"{key}.stiffness", spring.stiffness)
         rest = self.value(f"{key}.length", spring.length)
-        self.terms.potential += stiffness * (self._length(key, spring, rest == 0) - rest) ** 2 / 2
+        self.terms.potential += stiffness * (self.length(key, spring, rest == 0) - rest) ** 2 / 2
 
-    def _add_damper(self, key: str, damper: Damper) -> None:
+    def add_damper(self, key: str, damper: Damper) -> None:
+        """Add d/2 (dl/dt)^2 to the dissipation, with the length l of the damper."""
         damping = self.value(f"{key}.damping", damper.damping)
-        self.terms.dissipation += damping * dot(self._length(key, damper, False)) ** 2 / 2
+        self.terms.dissipation += damping * dot(self.length(key, damper, False)) ** 2 / 2
 
-    def _length(self, key: str, end: Spring | Damper, square: bool) -> Expr:
+    def length(self, key: str, end: Spring | Damper, square: bool) -> Expr:
         """Return the length of a spring or damper. square: only the squared length is needed."""
         if end.coordinate:
             return symbol(end.coordinate)
@@ -394,7 +408,7 @@ class Builder:
 
     # --- pieces ----------------------------------------------------------------------------------
 
-    def _kinetic_terms(
+    def kinetic_terms(
         self, mass: Expr, inertia: Sequence[Expr], position: Vector, place: _Place
     ) -> list[Expr]:
         """Return the kinetic energy of a body as terms of a sum.
@@ -415,7 +429,8 @@ class Builder:
         ]
         return energy + turning
 
-    def _gravity_potential(self, mass: Expr, position: Vector) -> Expr:
+    def gravity_potential(self, mass: Expr, position: Vector) -> Expr:
+        """Return -m g . c of a body with this mass (kg) and position (m) of its centre."""
         return -mass * spatial.dot(self.terms.gravity, position)
 
     def _vector(self, key: str, formulas: Sequence[Formula]) -> Vector:

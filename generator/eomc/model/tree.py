@@ -2,7 +2,7 @@
 
 `Tree` and `BodyFrame` are data for the recursive derivation of the equations. `Chains` gives the
 pose of a body relative to a body from which both of two bodies descend, for joints that close
-loops.
+loops. Numbers in vectors, rotations and unit axes are fractions of fifty digits.
 """
 
 from __future__ import annotations
@@ -10,19 +10,108 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+import mpmath
 import sympy
-from sympy import Expr, S, Symbol
+from sympy import Expr, Rational, S, Symbol
 
 from eomc.base import spatial
-from eomc.base.spatial import apply, plus, product, scaled, transposed
-from eomc.model import rational
-from eomc.model.rational import ONE, ZERO, Matrix, Vector
-from eomc.scene.assembly import WORLD
+from eomc.base.spatial import apply, cross, matrix, plus, product, scaled, transposed
+from eomc.scene.joints import MotionSubspace
+from eomc.scene.scene import WORLD
+
+Vector = spatial.Vector[Expr]
+Matrix = spatial.Matrix[Expr]
+
+DIGITS = 50  # decimal digits to which numbers are rounded
+INTEGER_TOLERANCE = 10**40  # numbers closer than 1e-40 to an integer are rounded to it
+
+ZERO: Vector = (S.Zero, S.Zero, S.Zero)
+ONE: Matrix = ((S.One, S.Zero, S.Zero), (S.Zero, S.One, S.Zero), (S.Zero, S.Zero, S.One))
+
+
+def rounded_number(e: Expr) -> Expr:
+    """Return a number as a fraction that is rounded to 50 digits.
+
+    A number within 1e-40 of an integer is rounded to that integer. An expression that is not a
+    number is returned unchanged.
+    """
+    if not e.is_number:
+        return e
+    if not e.is_Rational:
+        e = Rational(str(e.evalf(DIGITS + 5)))
+    whole = (2 * e.p + e.q) // (2 * e.q)
+    if abs(e.p - whole * e.q) * INTEGER_TOLERANCE < e.q:
+        return S(whole)
+    if e.q > 10**DIGITS:
+        with mpmath.workdps(DIGITS):
+            e = Rational(mpmath.nstr(mpmath.mpf(e.p) / e.q, DIGITS))
+    return e
+
+
+def rounded_vector(v: Vector) -> Vector:
+    """Return a copy of a vector with its numbers rounded to fractions of 50 digits.
+
+    Entries that are not numbers are unchanged.
+    """
+    x, y, z = map(rounded_number, v)
+    return (x, y, z)
+
+
+def rounded_matrix(matrix: Matrix) -> Matrix:
+    """Return a copy of a matrix with its numbers rounded to fractions of 50 digits.
+
+    Entries that are not numbers are unchanged.
+    """
+    one, two, three = map(rounded_vector, matrix)
+    return (one, two, three)
+
+
+def unit_vector(axis: Sequence[float]) -> list[Expr]:
+    """Return the unit vector along `axis` as fractions, normalised to 50 digits."""
+    entries = [Rational(str(x)) for x in axis]
+    with mpmath.workdps(DIGITS + 5):
+        long = [mpmath.mpf(x.p) / x.q for x in entries]
+        size = mpmath.sqrt(sum(x * x for x in long))
+        return [rounded_number(Rational(mpmath.nstr(x / size, DIGITS + 5))) for x in long]
+
+
+def aligned_with(axis: Sequence[float]) -> tuple[int, Matrix]:
+    """Return (k, R): a coordinate axis k (0, 1 or 2) and a rotation matrix R with R e_k = `axis`.
+
+    e_k is the unit vector along the coordinate axis k, and `axis` is normalised. R is exact to 50
+    digits. In the frame rotated by R, the direction `axis` is therefore the coordinate axis k.
+    """
+    along = unit_vector(axis)
+    for k, x in enumerate(along):
+        if abs(x) == 1:
+            half_turn = spatial.elementary_rotation((k + 1) % 3, S.NegativeOne, S.Zero)
+            return k, ONE if x == 1 else half_turn
+    # Gram-Schmidt, from the coordinate axis that is farthest from the axis
+    far = min(range(3), key=lambda i: (abs(along[i]), i))
+    first = [-along[far] * x for x in along]
+    first[far] += 1
+    size = sympy.sqrt(sum(x * x for x in first))
+    a = [rounded_number((x / size).evalf(DIGITS + 5)) if x != 0 else S.Zero for x in first]
+    return 2, transposed(matrix((a, rounded_vector(cross(along, a)), along)))
+
+
+def rotation_about(axis: int, angle: Expr) -> Matrix:
+    """Return the matrix of a rotation by `angle` (rad) about the coordinate axis 0, 1 or 2.
+
+    The matrix transforms the components of a vector from the rotated frame to the original one.
+    """
+    return spatial.elementary_rotation(axis, sympy.cos(angle), sympy.sin(angle))
+
+
+def rotation_about_vector(axis: Sequence[float], angle: Expr) -> Matrix:
+    """Return the matrix of a rotation by `angle` (rad) about any axis, as `rotation_about` does."""
+    k, aligned = aligned_with(axis)
+    return product(product(aligned, rotation_about(k, angle)), transposed(aligned))
 
 
 @dataclass(frozen=True)
 class Link:
-    """An elementary joint (one rotation or translation), its frame and the mass fixed in the frame.
+    """An elementary joint with one coordinate, its frame and the mass fixed in the frame.
 
     Attributes
     ----------
@@ -30,10 +119,11 @@ class Link:
         Name of the body to which the joint belongs.
     parent
         Index of the parent link; -1 for the world.
-    turns
-        True for a rotation, False for a translation.
     axis
         Coordinate axis (0, 1, 2) of the frame about which it turns or along which it slides.
+    angular, linear
+        Its motion subspace S = (angular e, linear e), with the unit vector e of the axis: (1, 0)
+        for a rotation, (0, 1) for a translation, (1, pitch in m/rad) for a screw.
     q
         Angle (rad) or displacement (m): a coordinate or an expression in coordinates.
     offset, rotation
@@ -48,8 +138,9 @@ class Link:
 
     name: str
     parent: int  # -1: the world
-    turns: bool
     axis: int
+    angular: Expr
+    linear: Expr
     q: Expr
     offset: Vector
     rotation: Matrix
@@ -132,15 +223,15 @@ class Step:
     angle
         Angle of `rotation` in rad, for a planar scene.
     motions
-        Motions of the joint, as tuples (kind, axis, amount). kind: "t" for a translation, "r" for
-        a rotation. axis: in the joint's frame. amount: in m or rad.
+        Motions of the joint, as pairs of a motion subspace in the joint's frame and a displacement
+        in m or rad.
     """
 
     parent: str
     offset: Vector
     rotation: Matrix
     angle: Expr
-    motions: tuple[tuple[str, Sequence[float], Expr], ...]
+    motions: tuple[tuple[MotionSubspace, Expr], ...]
 
 
 @dataclass
@@ -185,24 +276,13 @@ class Chains:
             step = self.steps[body]
             at = plus(at, apply(R, step.offset))
             R, angle = product(R, step.rotation), angle + step.angle
-            for motion, axis, by in step.motions:
-                k, aligned = rational.aligned_with(axis)
-                if motion == "t":
-                    x, y, z = map(S, rational.unit_vector(axis))
-                    at = plus(at, scaled(apply(R, (x, y, z)), by))
-                elif self.plane:
+            for (axis, angular, linear), by in step.motions:
+                x, y, z = map(S, unit_vector(axis))
+                at = plus(at, scaled(apply(R, (x, y, z)), linear * by))
+                if angular and self.plane:
                     angle = angle + by
                     R = rotation_about(2, angle)
-                else:
-                    turn = product(product(aligned, rotation_about(k, by)), transposed(aligned))
-                    R = product(R, turn)
+                elif angular:
+                    R = product(R, rotation_about_vector(axis, by))
             at, R = named(body, at, R)
         return at, R
-
-
-def rotation_about(axis: int, angle: Expr) -> Matrix:
-    """Return the matrix of a rotation by `angle` (rad) about the coordinate axis 0, 1 or 2.
-
-    The matrix transforms the components of a vector from the rotated frame to the original one.
-    """
-    return spatial.elementary_rotation(axis, sympy.cos(angle), sympy.sin(angle))

@@ -18,10 +18,10 @@ from eomc.derive.tape import Stage
 from eomc.program.ir import Assignment, Call, Function, Operand
 
 LARGE = 1000  # weight above which a function is split
-PIECE = 500  # weight of an outlined function, within a third
+PIECE = LARGE // 2  # weight of an outlined function, within a third
 # Portable C is to be read: a function stays whole up to some 3,000 lines, of 2.5 operations each.
 PORTABLE_LARGE = 7500
-PORTABLE_PIECE = 3000
+PORTABLE_PIECE = 2 * PORTABLE_LARGE // 5
 
 
 @dataclass(frozen=True)

@@ -10,19 +10,18 @@ from sympy import Add, Expr, S, Symbol, expand
 from eomc.base.errors import Problem, SceneError
 from eomc.base.texts import listed
 from eomc.derive import outputs
+from eomc.derive.constraints import projection, rate_terms
 from eomc.derive.frames import momentum, motions
-from eomc.derive.lagrange import MASSLESS, Derivation, inverse_dynamics
-from eomc.derive.ldl import Solution
-from eomc.derive.linearize import STICKS, linearization, sensitivity
+from eomc.derive.lagrange import MASSLESS, Derivation, EquationsOfMotion, inverse_dynamics
+from eomc.derive.ldl import Pairs, Solution, Vector
+from eomc.derive.outputs import STICKS, directional_derivatives, linearization, sensitivity
 from eomc.derive.tape import Stage, Tape
 from eomc.integrators.tableaux import METHODS
 from eomc.model.symbols import ALONG, Output, dot, needed_definitions, symbol
 from eomc.model.system import System, t
-from eomc.program import constrained
-from eomc.program.interpret import evaluator, nearby
-from eomc.program.ir import Call, Function
+from eomc.program.ir import Call, Function, evaluator, nearby
 from eomc.program.lower import lower
-from eomc.program.routes import ROUTES, Candidate, RouteInputs, cheapest
+from eomc.program.routes import ROUTES, Candidate, RouteInputs, cheapest, weight
 from eomc.scene.scene import Scene
 
 TIME = t.name
@@ -101,7 +100,7 @@ def build(derived: Derivation) -> Program:
     for function in _derivatives(system, taken):
         functions[function.name] = replace(function, route=best.route)
     additional = (
-        *constrained.functions(derived, taken),
+        *_constrained_functions(derived, taken),
         *_outputs(system, taken),
         *_events(system, taken),
         *_applied(system),
@@ -412,7 +411,7 @@ def _without_inertia(program: Program, k: int) -> list[str]:
     values = nearby(program.system, k)
     try:
         D = matrix(program, "D", values)
-        rows = constrained.weighted_gradients(program.functions, program.system, values)
+        rows = weighted_gradients(program.functions, program.system, values)
     except (ArithmeticError, ValueError):
         return names[:1]
     for w, row in rows:
@@ -443,10 +442,6 @@ def _null_motion(A: Sequence[Sequence[float]], i: int, names: Sequence[str]) -> 
 
 ENERGIES = frozenset({"kinetic_energy", "potential_energy", "energy", "jacobi", "power"})
 OUTPUTS = frozenset({"outputs", "output_slopes", "output_sensitivity"})
-SCENE_KEYS = {  # scene key of each expression
-    "kinetic": "kinetic", "potential": "potential", "linear_potential": "potential",
-    "dissipation": "dissipation",
-}  # fmt: skip
 
 
 def unused_parameters(program: Program) -> list[Problem]:
@@ -456,32 +451,21 @@ def unused_parameters(program: Program) -> list[Problem]:
     reported.
     """
     s = program.system
-    excluded = ENERGIES | OUTPUTS if s.scene else ENERGIES  # a scene says which outputs name it
+    excluded = ENERGIES | OUTPUTS  # the scene says which outputs name it
     used = {x for f in program.functions.values() if f.name not in excluded for x in f.uses}
     problems = []
     for p in s.parameters:
-        key = "" if p.name in used else _key_of(s, p.symbol)
+        key = _key_of(s.scene, p.name) if s.scene and p.name not in used else ""
         if key:
             message = f"'{p.name}' reaches no equation of motion: {_reason(s, p.symbol)}"
             problems.append(s.problem(key, message, "warning"))
     return problems
 
 
-def _key_of(system: System, parameter: Symbol) -> str:
-    """Return the key where a parameter first occurs; "" if it occurs outside of energies and
-    forces.
-    """
-    if system.scene:
-        roots = _tables(system.scene, parameter.name)
-        first = system.scene.used.get(parameter.name, [()])[0]
-        return ".".join(first) if roots and roots <= {"energy", "forces"} else ""
-    drawn = system.picture_scene and parameter.name in system.picture_scene.used
-    places = (
-        f"energy.{key}"
-        for name, key in SCENE_KEYS.items()
-        if _has(system, getattr(system, name), parameter)
-    )
-    return "" if drawn else next(places, "")
+def _key_of(scene: Scene, name: str) -> str:
+    """Return the key where a name first occurs; "" if it occurs outside of energies and forces."""
+    roots = _tables(scene, name)
+    return ".".join(scene.used[name][0]) if roots and roots <= {"energy", "forces"} else ""
 
 
 def _tables(scene: Scene, name: str) -> set[str]:
@@ -515,3 +499,129 @@ def _reason(system: System, parameter: Symbol) -> str:
         "what it adds to energies or forces cancels, or depends on no coordinate or velocity; "
         "remove it, or use it"
     )
+
+
+# --- constraints: residuals, multipliers, projection, reactions -----------------------------------
+
+
+def _constrained_functions(derived: Derivation, taken: Candidate) -> Iterator[Function]:
+    """Yield the additional functions of a system with constraints; none without constraints.
+
+    `derived` contains the equations of motion. `taken` is the selected computation of the
+    accelerations, which also gives the Lagrange multipliers.
+    """
+    system = derived.system
+    if not system.constraints:
+        return
+    yield from constraint_functions(derived)
+    names = [f"lambda_{c.name}" for c in system.constraints]
+    yield lower(
+        "multipliers", taken.tape, taken.multipliers, system.names, checks=taken.checks,
+        labels=names,
+    )  # fmt: skip
+    e, values, pivots, correction = min(
+        (_correction(system, e) for e in _all_equations(derived)),
+        key=lambda candidate: weight(candidate[-1].cost),
+    )
+    assert e.rows is not None
+    yield correction
+    if terms := rate_terms(e.tape, e.rows, system.qd):
+        yield lower("rate_terms", e.tape, terms, system.names)
+    if system.run.discretize:
+        corrections = values[: 2 * len(system.q)]
+        values_and_derivatives = [
+            *corrections,
+            *directional_derivatives(system, e.tape, corrections),
+        ]
+        yield lower("projection_along", e.tape, values_and_derivatives, system.names, checks=pivots)
+    if system.reactions:
+        yield _reactions(system)
+    if system.run.needs_derivatives:
+        gradients = [x for r in e.rows.rates for x in e.tape.gradient([(r, S.One)], system.q)]
+        yield lower("constraint_slopes", e.tape, gradients, system.names)
+
+
+def constraint_functions(derived: Derivation) -> Iterator[Function]:
+    """Yield the functions for residuals, Jacobian and rates of the constraint equations.
+
+    They are used to find initial values that satisfy the constraints. `derived` contains the
+    equations of motion.
+    """
+    system, e = derived.system, _equations(derived)
+    assert e.rows is not None
+    names = [c.name for c in system.constraints]
+    yield lower("constraints", e.tape, e.rows.values, system.names, labels=names)
+    jacobian = [x for row in e.rows.jacobian for x in row]
+    yield lower("constraint_jacobian", e.tape, jacobian, system.names)
+    labels = [f"{name}_rate" for name in names]
+    yield lower("constraint_rates", e.tape, e.rows.rates, system.names, labels=labels)
+    if errors := e.rows.rotation_errors:
+        slopes = [x for error, _ in errors for x in e.tape.gradient([(error, S.One)], system.q)]
+        values = [*(error for error, _ in errors), *(half for _, half in errors)]
+        yield lower("rotation_errors", e.tape, [*values, *slopes], system.names)
+
+
+def _equations(derived: Derivation) -> EquationsOfMotion:
+    """Return the equations with the constraints: the shorter ones if there are two."""
+    return min(
+        _all_equations(derived), key=lambda e: len(e.tape.live([x for row in e.D for x in row]))
+    )
+
+
+def _all_equations(derived: Derivation) -> list[EquationsOfMotion]:
+    """Return the equations of motion by Lagrange and by Newton-Euler, where they exist."""
+    return [e for e in (derived.lagrange, derived.newton_euler) if e is not None]
+
+
+def _correction(
+    system: System, e: EquationsOfMotion
+) -> tuple[EquationsOfMotion, Vector, Pairs, Function]:
+    """Derive the projection onto the constraints: the equations, corrections, pivots and the
+    function.
+    """
+    assert e.rows is not None
+    values, pivots = projection(e.tape, e.D, e.rows, system.q)
+    return e, values, pivots, lower("projection", e.tape, values, system.names, checks=pivots)
+
+
+def _reactions(system: System) -> Function:
+    """Return the function of forces and moments in the loops, which depend on the multipliers."""
+    values = [x for r in system.reactions for x in r.values]
+    formulas = tuple(Output(f"reaction_{k}", x) for k, x in enumerate(values))
+    multipliers = [c.multiplier for c in system.constraints]
+    derived = outputs.outputs(
+        replace(system, outputs=formulas), with_derivatives=False, extra_symbols=multipliers
+    )
+    return lower("reactions", derived.tape, derived.values, system.names)
+
+
+def weighted_gradients(
+    functions: Mapping[str, Function], system: System, values: Mapping[str, float]
+) -> list[tuple[float, list[float]]]:
+    """Return the pairs (weight w_k, gradient a_k) with which D + sum_k w_k a_k a_k^T is regular.
+
+    There is one pair for each constraint equation that is not redundant. The list is empty if the
+    mass matrix D is regular by itself.
+
+    Parameters
+    ----------
+    functions
+        Functions of the generated code by name, among them "constraint_jacobian".
+    values
+        Coordinates and parameters by name.
+
+    Raises
+    ------
+    ArithmeticError, ValueError
+        If an entry of the Jacobian is not a finite real number.
+    """
+    closure = system.closure
+    if closure is None or not closure.weights:
+        return []
+    flat, _ = evaluator(functions["constraint_jacobian"])(values)
+    n = len(system.q)
+    return [
+        (w, list(flat[n * k : n * k + n]))
+        for k, (w, row) in enumerate(zip(closure.weights, system.constraints, strict=True))
+        if not row.redundant
+    ]

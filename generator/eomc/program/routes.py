@@ -15,15 +15,14 @@ from functools import cached_property
 
 from sympy import Expr
 
-from eomc.derive import kkt
+from eomc.derive.constraints import constrained_accelerations
 from eomc.derive.lagrange import Derivation, EquationsOfMotion
 from eomc.derive.ldl import Rows, SolveResult, solve
 from eomc.derive.link_multipliers import prefer_short_chains
 from eomc.derive.tape import Tape
 from eomc.model.symbols import ALONG
 from eomc.model.system import System
-from eomc.program.interpret import evaluator, nearby
-from eomc.program.ir import Cost, Function
+from eomc.program.ir import Cost, Function, evaluator, nearby
 from eomc.program.lower import lower
 from eomc.program.polynomial import Expander
 
@@ -126,7 +125,7 @@ def _power(e: EquationsOfMotion) -> Expr:
     """
     if e.rows is None or not any(e.rows.drift):
         return e.power
-    multipliers = kkt.accelerations(e.tape, e.D, e.balance, e.rows).multipliers
+    multipliers = constrained_accelerations(e.tape, e.D, e.balance, e.rows).multipliers
     powers = [e.tape.times(x, v) for x, v in zip(multipliers, e.rows.drift, strict=True)]
     return e.tape.total([e.power, *powers])
 
@@ -184,7 +183,9 @@ def _expanded(material: RouteInputs) -> SolveResult:
     if material.expanded is None:
         return None
     rows = material.lagrange.rows if material.lagrange else None
-    return kkt.accelerations(*material.expanded, rows) if rows else solve(*material.expanded)
+    return (
+        constrained_accelerations(*material.expanded, rows) if rows else solve(*material.expanded)
+    )
 
 
 def _cancelled(material: RouteInputs) -> SolveResult:
@@ -194,13 +195,13 @@ def _cancelled(material: RouteInputs) -> SolveResult:
     rows = material.lagrange.rows if material.lagrange else None
     short = material.expander.short
     if rows:
-        return kkt.accelerations(*material.expanded, rows, short)
+        return constrained_accelerations(*material.expanded, rows, short)
     return solve(*material.expanded, short)
 
 
 def _constrained(e: EquationsOfMotion | None) -> SolveResult:
     """Return the constrained accelerations from equations that are not expanded."""
-    return kkt.accelerations(e.tape, e.D, e.balance, e.rows) if e and e.rows else None
+    return constrained_accelerations(e.tape, e.D, e.balance, e.rows) if e and e.rows else None
 
 
 def _by_articulated_bodies(_: System, order: str) -> str:
@@ -332,11 +333,15 @@ def _roundings(functions: Mapping[str, Function], system: System) -> dict[str, f
     multipliers fail where D may still be regular.
     """
     states = range(5 if all(len(f.body) < 500 for f in functions.values()) else 2)
-    errors = {route: _errors(f, system, states) for route, f in functions.items()}
-    comparable = [k for k in states if any(math.isfinite(values[k]) for values in errors.values())]
-    return {
-        route: max((values[k] for k in comparable), default=0.0) for route, values in errors.items()
-    }
+    return largest_errors({route: _errors(f, system, states) for route, f in functions.items()})
+
+
+def largest_errors(errors: Mapping[str, Sequence[float]]) -> dict[str, float]:
+    """Return the largest error of each route at the states at which a route has a result."""
+    comparable = [
+        column for column in zip(*errors.values(), strict=True) if any(map(math.isfinite, column))
+    ]
+    return {route: max((c[k] for c in comparable), default=0.0) for k, route in enumerate(errors)}
 
 
 def _errors(function: Function, system: System, states: Iterable[int]) -> list[float]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from eomc.base import texts
 from eomc.base.errors import EomcError, writing
-from eomc.emit.render import environment
+from eomc.emit.common.templates import environment
 from eomc.report.drawing import Drawing
 from eomc.report.style import html_name
 from eomc.report.timeline import BatchTimeline, Panel, Source, Timeline, find_system
@@ -203,6 +203,7 @@ class _RunOnPage:
 
     def data(self) -> dict[str, Any]:
         """Return the data of the run for the script of the page, to be written as JSON."""
+        has_stairs = self.timeline.has_stairs
         return {
             "t": [float(self.rows[0]), float(self.rows[-1])],
             "rows": base64.b64encode(self.rows.astype("<f8").tobytes()).decode("ascii"),
@@ -210,7 +211,10 @@ class _RunOnPage:
             "drawing": _drawing_data(self.drawing) if self.drawing else None,
             "many": len(self.timeline.key),
             "panels": [
-                [_quantize(line.values) | {"stairs": line.stairs} for line in p.lines]
+                [
+                    _quantize(c.values) | {"stairs": has_stairs and c.kind == "inputs"}
+                    for c in p.curves
+                ]
                 for p in self.panels
             ],
         }
@@ -241,12 +245,12 @@ class _RunOnPage:
 
 def _caption(panel: Panel) -> dict[str, Any]:
     """Return the caption of a panel: the names of its curves, or that of their common quantity."""
-    names = [panel.name] if panel.name else [line.name for line in panel.lines]
+    names = [panel.name] if panel.name else [curve.name for curve in panel.curves]
     return {
         "names": [Markup(html_name(n.removesuffix("_dot"), n.endswith("_dot"))) for n in names],
         "keyed": not panel.name,
         "plain": ", ".join(names).replace("_", " "),
-        "unit": texts.html(panel.unit),
+        "unit": texts.html(panel.curves[0].unit),
     }
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import reduce
 from hashlib import blake2b
 from typing import Any
 
@@ -20,16 +19,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from eomc.base import spatial
 from eomc.model.algebra import compile_function
+from eomc.model.kinematics import ForwardKinematics, Pose, rotate
 from eomc.model.system import System, dot
 from eomc.model.system import t as time
-from eomc.scene import formulas
-from eomc.scene.assembly import WORLD, Assembly, LoopJoint, RigidBody, SpringDamper, Turn
 from eomc.scene.formulas import Formula
-from eomc.scene.joints import JOINTS
-from eomc.scene.scene import Scene, Shape
+from eomc.scene.scene import WORLD, Assembly, LoopJoint, RigidBody, Scene, Shape, SpringDamper
 
 Array = NDArray[np.float64]
-Pose = tuple[Array, Array]  # position (n, 3) and rotation (n, 3, 3) of a frame at n states
 TRAVEL_LIMIT = 8.0  # times its own extent: how far a mechanism may move in one picture
 PLANE_TOLERANCE = 1e-9  # relative to the size of the drawing
 MAX_PATHS = 3
@@ -174,8 +170,7 @@ def _draw(system: System, t: Array, q: Array) -> Drawing | None:
     values: dict[str, Any] = {p.name: p.value for p in system.parameters}
     columns = zip(system.coordinates, q.T, strict=True)
     values |= {c.name: own for c, own in columns if c.name in system.discrete}
-    scene = system.scene or system.picture_scene
-    declared = _draw_declared(scene, values, t, q) if scene else None
+    declared = _draw_declared(system.scene, values, t, q) if system.scene else None
     return declared or _draw_named_points(system, t, q)
 
 
@@ -293,19 +288,6 @@ def _superpose(drawings: Sequence[Drawing | None], names: Sequence[str]) -> Draw
 
 
 # --- what a scene declares of its shape -----------------------------------------------------------
-#
-# An independent forward kinematics, evaluated from the scene's formulas at many states at once. It
-# shares nothing with the derivation of the equations.
-
-ARRAYS: Mapping[str, Any] = {
-    **formulas.NUMERIC,
-    **{name: getattr(np, name) for name in "sin cos tan sinh cosh tanh exp log sqrt sign".split()},
-    "asin": np.arcsin, "acos": np.arccos, "atan": np.arctan, "atan2": np.arctan2, "abs": np.abs,
-    "heaviside": lambda x: np.heaviside(x, 0.5),
-    "min": lambda *x: reduce(np.minimum, x),
-    "max": lambda *x: reduce(np.maximum, x),
-    "dot": lambda x: 0.0 * x,  # its argument is constant: others are refused by the scene's checks
-}  # fmt: skip
 
 
 def _draw_declared(scene: Scene, values: Mapping[str, Any], t: Array, q: Array) -> Drawing | None:
@@ -318,27 +300,17 @@ def _draw_declared(scene: Scene, values: Mapping[str, Any], t: Array, q: Array) 
         return _Sketch(scene, values, t, q).drawing()
 
 
-class _Sketch:
+class _Sketch(ForwardKinematics):
+    """The drawing of a scene at n instants, while marks are added to it."""
+
     def __init__(self, scene: Scene, values: Mapping[str, Any], t: Array, q: Array) -> None:
-        self.scene, self.n = scene, len(t)
-        self.known: dict[str, Any] = {
-            p.name: p.value for p in (*scene.constants, *scene.parameters)
-        }
-        self.known |= {name: values[name] for name in values.keys() & self.known.keys()}
-        names = [c.name for c in scene.coordinates]  # columns of q after them are friction modes
-        self.known |= dict(zip(names, q.T, strict=False)) | {"t": t}
-        self.definitions = dict(scene.definitions)
+        super().__init__(scene, t, q, values)
         self.marks = Marks(self.n)
-        world_pose = np.zeros((self.n, 3)), np.broadcast_to(np.eye(3), (self.n, 3, 3))
-        self.poses: dict[str, Pose] = {WORLD: world_pose}
-        self.joint_frames: dict[str, Pose] = {}  # frames of joints at zero displacement
-        self.centers: dict[str, Array] = {}  # centres of mass, in the world frame
 
     def drawing(self) -> Drawing | None:
         """Return the drawing, or None if the scene declares nothing that can be drawn."""
         assembly, picture = self.scene.assembly, self.scene.picture
         if assembly:
-            self._place(assembly)
             self._draw_skeleton(assembly)
         if picture:
             for shape in picture.shapes:
@@ -355,70 +327,8 @@ class _Sketch:
         """Return the index of the upward axis, opposite to gravity."""
         if assembly is None:
             return 2
-        pull = np.abs([float(self._number(g)) for g in assembly.gravity])
+        pull = np.abs([float(self.number(g)) for g in assembly.gravity])
         return int(pull.argmax()) if pull.any() else 2
-
-    # --- values ----------------------------------------------------------------------------------
-
-    def _number(self, formula: Formula) -> Any:
-        return formulas.evaluate(formula, ARRAYS, self._lookup)
-
-    def _lookup(self, name: str) -> Any:
-        if name not in self.known:
-            if name in self.definitions:
-                self.known[name] = self._number(self.definitions[name])
-            else:
-                body, letter = name[:-2], name[-1]
-                self.known[name] = self.centers[body][:, "xyz".index(letter)]
-        return self.known[name]
-
-    def _vector(self, entries: Sequence[Formula]) -> Array:
-        """Evaluate a vector of formulas, (n, 3)."""
-        columns = [np.broadcast_to(self._number(entry), self.n) for entry in entries]
-        return np.stack(columns, axis=1).astype(float)
-
-    def _rotation(self, turns: Sequence[Turn]) -> Array:
-        """Return the rotation matrices of successive turns, (n, 3, 3)."""
-        R = self.poses[WORLD][1]
-        for turn in turns:
-            R = R @ self._axis_rotation(np.eye(3)["xyz".index(turn.axis)], self._number(turn.angle))
-        return R
-
-    def _axis_rotation(self, axis: Sequence[float] | Array, angle: Any) -> Array:
-        angle = np.broadcast_to(angle, self.n)
-        rows = spatial.axis_angle_rotation(tuple(axis), np.cos(angle), np.sin(angle))
-        return np.stack([np.stack(row, axis=-1) for row in rows], axis=1)
-
-    # --- bodies ----------------------------------------------------------------------------------
-
-    def _place(self, assembly: Assembly) -> None:
-        """Compute the poses of all frames, those of bodies on joints first."""
-        for body in assembly.bodies:
-            if body.joint:
-                at, R = self.poses[body.parent]
-                if body.offset:
-                    at = at + _rotate(R, self._vector(body.offset))
-                R = R @ self._rotation(body.rotation)
-                self.joint_frames[body.name] = at, R
-                self.poses[body.name] = self._after_joint(body, at, R)
-                at, R = self.poses[body.name]
-                self.centers[body.name] = at + _rotate(R, self._vector(body.center))
-        for body in assembly.bodies:
-            if body.position:
-                pose = self._vector(body.position), self._rotation(body.rotation)
-                self.poses[body.name], self.centers[body.name] = pose, pose[0]
-
-    def _after_joint(self, body: RigidBody, at: Array, R: Array) -> Pose:
-        kind = JOINTS[body.joint]
-        along = zip(kind.motions, kind.motion_axes(body.axes), body.coordinates, strict=True)
-        for motion, axis, by in along:
-            unit = np.array(axis) / np.linalg.norm(axis)
-            moved = self._number(by)
-            if motion == "t":
-                at = at + _rotate(R, np.broadcast_to(moved, self.n)[:, None] * unit)
-            else:
-                R = R @ self._axis_rotation(unit, moved)
-        return at, R
 
     def _draw_skeleton(self, assembly: Assembly) -> None:
         for body in assembly.bodies:
@@ -441,15 +351,16 @@ class _Sketch:
         at = marks.add_point(seat)
         if body.parent != WORLD:
             marks.add_mark("rod", marks.add_point(self.poses[body.parent][0]), at)
-        motions = JOINTS[body.joint].motions
         if body.joint in ("free", "planar"):
             return
-        if body.parent == WORLD and not body.point and "t" not in motions:
+        motions = self.joint_motions(body)
+        slides = [(axis, linear * moved) for (axis, _, linear), moved in motions if linear]
+        if body.parent == WORLD and not body.point and not slides:
             marks.add_mark("ground", at)
-        if "t" in motions:
-            axis = JOINTS[body.joint].motion_axes(body.axes)[motions.index("t")]
-            direction = np.broadcast_to(self._number(body.coordinates[motions.index("t")]), self.n)
-            unit = _rotate(R, np.broadcast_to(np.array(axis) / np.linalg.norm(axis), (self.n, 3)))
+        if slides:
+            axis, distance = slides[0]
+            direction = np.broadcast_to(distance, self.n)
+            unit = rotate(R, np.broadcast_to(np.array(axis) / np.linalg.norm(axis), (self.n, 3)))
             ends = (marks.add_point(seat + x * unit) for x in (direction.min(), direction.max()))
             marks.add_mark("rail", *ends)
             marks.add_mark("slide", marks.add_point(self.poses[body.name][0]))
@@ -463,7 +374,7 @@ class _Sketch:
         marks, ends = self.marks, list[Array]()
         for k, name in enumerate(loop.bodies):
             at, R = self.poses[name]
-            ends.append(at + _rotate(R, self._vector(loop.points[k])) if loop.points else at)
+            ends.append(at + rotate(R, self.vector(loop.points[k])) if loop.points else at)
             marks.add_mark(
                 "ground" if name == WORLD else "rod",
                 *self._support_points(name, marks.add_point(ends[k])),
@@ -472,7 +383,7 @@ class _Sketch:
         if loop.joint == "distance":
             marks.add_mark("rod", first, second)
         if loop.joint in ("prismatic", "cylindrical", "point-on-line"):
-            unit = _rotate(self.poses[loop.bodies[0]][1], np.tile(loop.axes[0], (self.n, 1)))
+            unit = rotate(self.poses[loop.bodies[0]][1], np.tile(loop.axes[0], (self.n, 1)))
             direction = np.sum((ends[1] - ends[0]) * unit, axis=1)
             marks.add_mark(
                 "rail",
@@ -485,7 +396,7 @@ class _Sketch:
 
     def _draw_center_of_mass(self, body: RigidBody, plane: bool) -> None:
         """Draw the centre of mass; in the plane also the orientation of the body."""
-        mass = float(self._number(body.mass))
+        mass = float(self.number(body.mass))
         if mass <= 0:
             return
         marks, center, (origin, R) = self.marks, self.centers[body.name], self.poses[body.name]
@@ -493,7 +404,7 @@ class _Sketch:
         if body.joint:
             marks.add_mark("arm", marks.add_point(origin), at)
         if plane:
-            radius = np.sqrt(max(float(self._number(body.inertia[2])), 0) / mass)  # of gyration
+            radius = np.sqrt(max(float(self.number(body.inertia[2])), 0) / mass)  # of gyration
             marks.add_mark(
                 "mass", at, *([marks.add_point(center + radius * R[:, :, 0])] if radius else [])
             )
@@ -522,7 +433,7 @@ class _Sketch:
 
         `R` is the rotation of the box. With edges 2a, 2b, 2c, Ixx = m (b² + c²)/3.
         """
-        masses = np.array([float(self._number(body.mass)) for body in group])
+        masses = np.array([float(self.number(body.mass)) for body in group])
         if not masses.sum() > 0:
             return
         centers = np.stack([self.centers[body.name] for body in group])  # (bodies, n, 3)
@@ -534,7 +445,7 @@ class _Sketch:
             d, turned = R[0].T @ (own[0] - center[0]), np.eye(3)
             if body is not group[0]:
                 turned = R[0].T @ self.poses[body.name][1][0]
-            inertia = [float(self._number(entry)) for entry in body.inertia]
+            inertia = [float(self.number(entry)) for entry in body.inertia]
             inertia_sum += turned @ spatial.tensor(inertia) @ turned.T
             inertia_sum += m * (d @ d * np.eye(3) - np.outer(d, d))
         if not np.isfinite(inertia_sum).all():
@@ -554,19 +465,22 @@ class _Sketch:
             points = []
             for name, place in zip(end.bodies, end.points, strict=True):
                 at, R = self.poses[name]
-                points.append(marks.add_point(at + _rotate(R, self._vector(place))))
+                points.append(marks.add_point(at + rotate(R, self.vector(place))))
                 marks.add_mark(
                     "ground" if name == WORLD else "rod", *self._support_points(name, points[-1])
                 )
             marks.add_mark(kind, *points)
             return
         for body in assembly.bodies:
-            motions = JOINTS[body.joint].motions if body.joint else ""
+            motions = self.joint_motions(body) if body.joint else []
+            if len(motions) != 1:
+                continue
+            angular = motions[0][0].angular
             by = [formula.text for formula in body.coordinates]
             turns = end.turning and end.bodies and {body.name, body.parent} == {*end.bodies}
-            if motions == "r" and (turns or by == [end.coordinate]) and kind == "spring":
+            if angular and (turns or by == [end.coordinate]) and kind == "spring":
                 marks.add_mark("spiral", marks.add_point(self.joint_frames[body.name][0]))
-            elif motions == "t" and by == [end.coordinate]:
+            elif not angular and by == [end.coordinate]:
                 ends = (self.joint_frames[body.name][0], self.poses[body.name][0])
                 marks.add_mark(kind, *map(marks.add_point, ends))
 
@@ -600,20 +514,15 @@ class _Sketch:
             marks.add_mark(shape.kind, *points)
         else:
             center, R = at[0]
-            R = R @ self._rotation(shape.rotation)
-            sizes = [float(self._number(size)) for size in shape.size]
+            R = R @ self.rotation(shape.rotation)
+            sizes = [float(self.number(size)) for size in shape.size]
             halves = sizes * 2 if shape.kind == "circle" else [size / 2 for size in sizes]
             tips = (marks.add_point(center + h * R[:, :, k]) for k, h in enumerate(halves))
             marks.add_mark(shape.kind, points[0], *tips)
 
     def _pose_of_place(self, name: str, at: Sequence[Formula] | None) -> Pose:
         """Return the position of a place and the axes there."""
-        return self.poses[name] if at is None else (self._vector(at), self.poses[WORLD][1])
-
-
-def _rotate(R: Array, v: Array) -> Array:
-    turned: Array = np.einsum("nij,nj->ni", R, v)
-    return turned
+        return self.poses[name] if at is None else (self.vector(at), self.poses[WORLD][1])
 
 
 # --- points that a scene only names ---------------------------------------------------------------

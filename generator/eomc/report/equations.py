@@ -10,29 +10,28 @@ from functools import cache, cached_property
 from typing import Any
 
 import sympy
-from sympy import Expr, ImmutableMatrix, MatrixBase, Symbol, cos, sin
+from sympy import Expr, Float, ImmutableMatrix, MatrixBase, Rational, Symbol, cos, sin
 from sympy.core.function import Application
 from sympy.printing.str import StrPrinter
 
 from eomc import pipeline
 from eomc.base import texts
 from eomc.base.errors import EomcError
+from eomc.model.algebra import DefinedFunction
 from eomc.model.hybrid import with_constant_parameters
 from eomc.model.symbols import resolve_definitions, symbol
 from eomc.model.system import Constraint, System, t
 from eomc.pipeline import ScenePath
 from eomc.report.typeset import (
-    CONTINUATION,
-    WIDE,
+    Equation,
+    TypesetMatrix,
     Typesetter,
-    distribute_decimal,
-    latex_sum,
-    named_lines,
-    section,
     shorten_fractions,
+    simple_fraction,
     wrap,
+    write_latex,
+    write_text,
 )
-from eomc.runtime.labels import tex
 from eomc.scene.formulas import suggest
 from eomc.verify import symbolic
 from eomc.verify.trig_simplify import coefficients, simplify_trig
@@ -42,7 +41,6 @@ Terms = list[tuple[Expr, Expr]]  # a product of accelerations or rates, and its 
 MAX_EXPANDED_SIZE = 30_000  # size by symbolic.is_small; simplification then takes seconds
 MAX_DERIVED_OPERATIONS = 8_000  # in D, C and bias before simplification
 MAX_WRITTEN_OPERATIONS = 1_000  # in the printed equations, which then fill a page or two
-MAX_ENVIRONMENT_LENGTH = 3_000  # characters of LaTeX: KaTeX accepts about a page
 
 
 @dataclass(frozen=True, repr=False)
@@ -79,8 +77,8 @@ class Equations:
 
     Notes
     -----
-    `str` returns text at most 100 columns wide, and a notebook shows the equations typeset. Long
-    equations are printed with names for shared subexpressions.
+    `str` returns text at most 100 columns wide, and a notebook shows the equations typeset, and so
+    each of `equations`. Long equations are printed with names for shared subexpressions.
 
     Examples
     --------
@@ -158,25 +156,31 @@ class Equations:
         each resulting expression.
         """
 
-        def substituted(e: Expr) -> Expr:
-            return form(e.xreplace(values))
-
-        matrices = ("D", "C", "g", "tau", "forces", "zero", "A")
-        scalars = ("kinetic", "potential", "linear_potential", "jacobi", "power")
-        changed: dict[str, Any] = {
-            name: getattr(self, name).applyfunc(substituted) for name in matrices
-        }
-        changed |= {
-            name: substituted(e) for name in scalars if (e := getattr(self, name)) is not None
-        }
+        changed = self.map(lambda e: form(e.xreplace(values)))
         return replace(
-            self,
-            **changed,
-            left=tuple(
-                [(e.xreplace(values), substituted(c)) for e, c in terms] for terms in self.left
-            ),
-            named=tuple((s.xreplace(values), substituted(e)) for s, e in self.named),
+            changed,
+            left=tuple([(e.xreplace(values), c) for e, c in terms] for terms in changed.left),
+            named=tuple((s.xreplace(values), form(e.xreplace(values))) for s, e in self.named),
         )
+
+    def map(self, function: Callable[[Expr], Expr]) -> Equations:
+        """Return a copy with `function` of each coefficient, entry of a matrix, energy and power.
+
+        The function is called in a fixed order, and of the symmetric D only for the upper triangle.
+        """
+        left = tuple([(rates, function(c)) for rates, c in terms] for terms in self.left)
+        n = range(self.D.rows)
+        upper = {(i, j): function(self.D[i, j]) for i in n for j in n[i:]}
+        changed: dict[str, Any] = {
+            "D": ImmutableMatrix(len(n), len(n), lambda i, j: upper[min(i, j), max(i, j)])
+        }
+        for name in ("C", "g", "tau", "forces", "zero", "A"):
+            matrix = getattr(self, name)
+            changed[name] = ImmutableMatrix(*matrix.shape, [function(e) for e in matrix])
+        for name in ("kinetic", "potential", "jacobi", "power", "linear_potential"):
+            if (e := getattr(self, name)) is not None:
+                changed[name] = function(e)
+        return replace(self, left=left, **changed)
 
     def with_user_symbols(self) -> Equations:
         """Return the equations over the user's symbols instead of the internal ones.
@@ -192,7 +196,10 @@ class Equations:
             names += sorted(inside.difference(names))
         symbols = {name: s.own_symbols.get(name, sympy.Symbol(name)) for name in names}
         changed = self.substitute({symbol(n): new for n, new in symbols.items()}, lambda e: e)
-        return replace(changed, symbols=symbols, _internal=self)
+        changed = replace(changed, symbols=symbols, _internal=self)
+        quantities = list_quantities(changed).items()
+        matrices = {n: TypesetMatrix.define(e) for n, e in quantities if e.right.is_Matrix}
+        return replace(changed, **matrices)
 
     def with_values(self, values: Mapping[Any, Any] | None = None, /, **by_name: Any) -> Equations:
         """Return a copy of the equations with numbers in place of some or all parameters.
@@ -230,15 +237,37 @@ class Equations:
             new[parameters[name]] = _exact(value, f"with_values: {name}")
         return self._internal.substitute(new, shorten_fractions).with_user_symbols()
 
+    @cached_property
+    def typesetter(self) -> Typesetter:
+        """Printer of expressions over `symbols`."""
+        return Typesetter(self.system, self.symbols)
+
+    @cached_property
+    def groups(self) -> tuple[tuple[Equation, ...], tuple[Equation, ...]]:
+        """The equations of motion with constraints and abbreviations, and all other formulas."""
+        quantities = list_quantities(self).values()
+        return (*list_motion(self),), (*quantities, *list_outputs(self))
+
+    @property
+    def equations(self) -> tuple[Equation, ...]:
+        """All equations: those of motion, constraints, energies, matrices and outputs.
+
+        Each has a title and two sides, and a notebook shows it typeset.
+        """
+        motion, others = self.groups
+        return (*motion, *others)
+
     def __repr__(self) -> str:
         s = self.system
         return f"<Equations of {s.name}: {s.size}; print() shows them>"
 
     def __str__(self) -> str:
-        return write_text((self._internal or self).set_out)
+        s, shown = self.system, self.set_out
+        form = equation_form(any(e != 0 for e in shown.tau), s)
+        return "\n\n".join([wrap(f"{title_line(s)}: {form}"), *write_text(shown.equations)])
 
     def _repr_latex_(self) -> str:
-        return write_latex((self._internal or self).set_out)
+        return write_latex(self.set_out.groups)
 
 
 def equations(scene: System | ScenePath) -> Equations:
@@ -314,10 +343,15 @@ def derive(system: System) -> Equations:
 
 
 def _exact(value: Any, what: str) -> Expr:
-    """Return a real, finite number in SymPy, a decimal as a fraction. Raises EomcError."""
+    """Return a real, finite number in SymPy, a decimal as a fraction. Raises EomcError.
+
+    A float such as 2.6666666666666665 is the fraction of few digits that rounds to it, if there is
+    one, and else the decimal of its text.
+    """
     try:
-        number = sympy.Rational(repr(float(value))) if not isinstance(value, Expr) else value
-        number = sympy.nsimplify(number, rational=True) if number.has(sympy.Float) else number
+        number = sympy.sympify(value) if isinstance(value, Expr) else sympy.Float(float(value))
+        rational = {x: simple_fraction(x) or Rational(repr(float(x))) for x in number.atoms(Float)}
+        number = number.xreplace(rational)
     except (TypeError, ValueError, OverflowError):
         number = None
     if number is None or not (number.is_number and number.is_real and number.is_finite):
@@ -372,29 +406,17 @@ def abbreviate(equations: Equations) -> Equations:
     """
     entries = _entries_of_D(equations)
     left = tuple([(rates, entries.get(c, c)) for rates, c in terms] for terms in equations.left)
-    n = range(equations.D.rows)
-    half = [equations.D[i, j] for i in n for j in n[i:]]
-    matrices = [getattr(equations, name) for name in ("C", "g", "tau", "forces", "zero", "A")]
-    scalars = [
-        equations.kinetic, equations.potential, equations.jacobi, equations.power,
-        equations.linear_potential,
-    ]  # fmt: skip
-    coefficients = [c for terms in left for _, c in terms]
-    formulas = [*coefficients, *half, *(e for m in matrices for e in m)]
-    formulas += [e for e in scalars if e is not None]
+    equations = replace(equations, left=left)
+    formulas: list[Expr] = []
+
+    def collect(e: Expr) -> Expr:
+        formulas.append(e)
+        return e
+
+    equations.map(collect)
     named, reduced = extract_common_subexpressions(formulas, _unused_letter(equations.system))
     new = iter(reduced)
-    left = tuple([(rates, next(new)) for rates, _ in terms] for terms in left)
-    upper = {(i, j): next(new) for i in n for j in n[i:]}
-    D = ImmutableMatrix(len(n), len(n), lambda i, j: upper[min(i, j), max(i, j)])
-    C, g, tau, forces, zero, A = (
-        ImmutableMatrix(m.rows, m.cols, [next(new) for _ in m]) for m in matrices
-    )
-    K, P, jacobi, power, U = (None if e is None else next(new) for e in scalars)
-    return replace(
-        equations, D=D, C=C, g=g, tau=tau, forces=forces, zero=zero, A=A, kinetic=K, potential=P,
-        jacobi=jacobi, power=power, linear_potential=U, left=left, named=tuple(named),
-    )  # fmt: skip
+    return replace(equations.map(lambda _: next(new)), named=tuple(named))
 
 
 def extract_common_subexpressions(
@@ -407,7 +429,8 @@ def extract_common_subexpressions(
     """
     temporary = sympy.numbered_symbols("_", real=True)
     subexpressions, reduced = sympy.cse(formulas, order="none", symbols=temporary)
-    uses = Counter(s for e in (*(e for _, e in subexpressions), *reduced) for s in _symbols(e))
+    rewritten = (*(e for _, e in subexpressions), *reduced)
+    uses = Counter(s for e in rewritten for s in sympy.preorder_traversal(e) if s.is_Symbol)
     inside: dict[Symbol, Expr] = {}
     named: list[tuple[Symbol, Expr]] = []
     for name, e in subexpressions:
@@ -424,11 +447,6 @@ def _deserves_name(e: Expr) -> bool:
     """True if `e` contains a sum and enough operations, those inside angles not counted."""
     bare = e.xreplace({f: f.func(sympy.Dummy()) for f in e.atoms(sin, cos)})
     return bool(bare.has(sympy.Add)) and bool(bare.count_ops() >= MIN_OPERATIONS)
-
-
-def _symbols(e: Expr) -> Iterator[Expr]:
-    """Iterate over all occurrences of symbols in `e`."""
-    return (part for part in sympy.preorder_traversal(e) if part.is_Symbol)
 
 
 def _entries_of_D(equations: Equations) -> dict[Expr, Symbol]:
@@ -453,76 +471,65 @@ def _unused_letter(system: System) -> str:
     return "abbreviation"
 
 
-# --- printing -------------------------------------------------------------------------------------
+# --- the list of equations ------------------------------------------------------------------------
 
-_MEANING = {
-    "kinetic": "kinetic energy",
-    "potential": "potential energy",
-    "linear_potential": "potential linear in the velocities",
-    "L": "Lagrangian K - P",
-    "D": "mass matrix",
-    "C": "Coriolis matrix, Christoffel form",
-    "g": "potential forces",
-    "tau": "generalized forces",
-    "A": "derivatives of the constraints along q, or q̇ where they are of rates",
-    "jacobi": "Jacobi integral, conserved in place of K + P",
-    "power": "power into the system",
+QUANTITIES = {  # symbol and title of each quantity, by its name among the attributes of Equations
+    "kinetic": ("K", "kinetic energy"),
+    "potential": ("P", "potential energy"),
+    "linear_potential": ("U", "potential linear in the velocities"),
+    "L": ("L", "Lagrangian K - P"),
+    "D": ("D", "mass matrix"),
+    "C": ("C", "Coriolis matrix, Christoffel form"),
+    "g": ("g", "potential forces"),
+    "tau": ("tau", "generalized forces"),
+    "A": ("A", "derivatives of the constraints along q, or q̇ where they are of rates"),
+    "jacobi": ("h", "Jacobi integral, conserved in place of K + P"),
+    "power": ("power", "power into the system"),
 }
-_SYMBOL = {
-    "kinetic": "K", "potential": "P", "linear_potential": "U", "jacobi": "h", "power": "power",
-    "tau": "τ",
-}  # fmt: skip
-_LATEX = {**_SYMBOL, "tau": r"\tau", "power": r"\dot h"}
 
 
-def _values(equations: Equations) -> dict[str, Expr | MatrixBase]:
-    """Return the expressions to be printed, by name."""
-    values = {name: getattr(equations, name) for name in _MEANING}
+def list_motion(equations: Equations) -> Iterator[Equation]:
+    """Yield the scalar equations of motion, the constraints, and the definitions of names."""
+    write = equations.typesetter
+    for e in equations.scalar:
+        yield Equation("equations of motion", e.lhs, e.rhs, write)
+    for c, zero in zip(equations.system.constraints, equations.zero, strict=True):
+        yield Equation("constraints", zero, sympy.S.Zero, write, constraint_note(c))
+    for name, e in equations.named:
+        yield Equation("where, here and below", name, e, write)
+
+
+def list_quantities(equations: Equations) -> dict[str, Equation]:
+    """Return the definitions of the energies and matrices, by the names of QUANTITIES."""
+    values = {name: getattr(equations, name) for name in QUANTITIES}
+    has_linear = equations.linear_potential is not None
     if equations.named:
-        values["L"] = sympy.Symbol("K") - sympy.Symbol("P")
-        if equations.linear_potential is not None:
-            values["L"] -= sympy.Symbol("U")
+        values["L"] = Symbol("K") - Symbol("P") - Symbol("U") * int(has_linear)
     if not equations.system.constraints:
         del values["A"]
     if all(e == 0 for e in equations.tau):
         del values["tau"]
-    return {name: value for name, value in values.items() if value is not None}
+    return {
+        name: Equation(
+            title + " - U" * (has_linear and name == "L"),
+            Symbol(letter),
+            values[name],
+            equations.typesetter,
+        )
+        for name, (letter, title) in QUANTITIES.items()
+        if values.get(name) is not None
+    }
 
 
-# --- text -----------------------------------------------------------------------------------------
-
-
-def write_text(equations: Equations) -> str:
-    """Return the equations as Unicode text for a terminal, in lines of at most WIDE + 4 columns."""
-    system, write = equations.system, Typesetter(equations.system)
-    values, section_lines = _values(equations), list[str]()
-    parts = [wrap(f"{title_line(system)}: {equation_form('tau' in values, system)}")]
-    lines = []
-    for left, force in zip(equations.left, equations.right, strict=True):
-        lines += [
-            *write.text_lines([write.term(a, b) for a, b in _flat(left)], _terms(write, force)),
-            "",
-        ]
-    parts.append(section("equations of motion", lines[:-1]))
-    if system.constraints:
-        section_lines = []
-        for c, zero in zip(system.constraints, equations.zero, strict=True):
-            section_lines += [*write.text_lines(write.terms(zero), []), *constraint_note(c)]
-        parts.append(section("constraints", section_lines))
-    if equations.named:
-        section_lines = [line for s, e in equations.named for line in named_lines(write, s.name, e)]
-        parts.append(section("where, here and below", section_lines))
-    for name, value in values.items():
-        head = f"{_SYMBOL.get(name, name)}, {_MEANING[name]}"
-        if name == "L" and equations.linear_potential is not None:
-            head += " - U"
-        parts.append(section(head, list(_value_lines(write, name, value))))
-    if system.outputs:
-        section_lines = []
-        for name, formula in _outputs(system):
-            section_lines += named_lines(write, name, formula)
-        parts.append(section("outputs", section_lines))
-    return "\n\n".join(parts)
+def list_outputs(equations: Equations) -> Iterator[Equation]:
+    """Yield the definitions of the outputs, with all definitions of the scene substituted."""
+    system = equations.system
+    known = resolve_definitions(system.definitions)
+    known |= {c.multiplier: symbol(f"lambda_{c.name}") for c in system.constraints}
+    own = {symbol(name): s for name, s in equations.symbols.items()}
+    for o in system.outputs:
+        formula = o.formula.xreplace(known).xreplace(own)
+        yield Equation("outputs", Symbol(o.name), formula, equations.typesetter)
 
 
 def title_line(system: System) -> str:
@@ -536,7 +543,8 @@ def equation_form(driven: bool, system: System) -> str:
     An example is "D q̈ + C q̇ + g = τ, q = (x, theta)". driven: True if the right-hand side has
     generalized forces τ.
     """
-    return f"D q̈ + C q̇ + g = {right_hand_side(driven, system)}, q = ({_order(system)})"
+    order = ", ".join(c.name for c in system.coordinates)
+    return f"D q̈ + C q̇ + g = {right_hand_side(driven, system)}, q = ({order})"
 
 
 def right_hand_side(driven: bool, system: System) -> str:
@@ -547,127 +555,13 @@ def right_hand_side(driven: bool, system: System) -> str:
     return " + ".join([*(["τ"] * driven), *(["Aᵀλ"] * bool(system.constraints))]) or "0"
 
 
-def constraint_note(c: Constraint) -> list[str]:
-    """Return one line, in a list: a constraint's name and kind, and whether it is redundant.
+def constraint_note(c: Constraint) -> str:
+    """Return a constraint's name and kind, and whether it is redundant, as one line.
 
     The kind is "positions" if the constraint is holonomic, else "rates".
     """
-    parts = [f"{c.name}: of {'positions' if c.holonomic else 'rates'}"]
-    parts += ["implied by others, its multiplier 0"] if c.redundant else []
-    return [f"    {', '.join(parts)}"]
-
-
-def _order(system: System) -> str:
-    return ", ".join(c.name for c in system.coordinates)
-
-
-def _flat(terms: Terms) -> Iterator[tuple[Expr, Expr]]:
-    """Yield the terms of an equation, with sums without velocities split into their terms."""
-    for monomial, c in terms:
-        if monomial == 1:
-            yield from ((sympy.S.One, part) for part in sympy.Add.make_args(distribute_decimal(c)))
-        else:
-            yield monomial, c
-
-
-def _terms(write: Typesetter, e: Expr) -> list[tuple[bool, Expr]]:
-    return [] if e == 0 else write.terms(e)
-
-
-def _value_lines(write: Typesetter, name: str, value: Expr | MatrixBase) -> Iterator[str]:
-    """Yield the lines of an energy or matrix; of a matrix that is too wide, the nonzero entries."""
-    if not isinstance(value, MatrixBase):
-        yield from _sum_lines(write, value)
-        return
-    block = write.text(write.sort_expression(value))
-    if block.width() <= WIDE:
-        yield from (line.rstrip() for line in str(block).splitlines())
-        return
-    for (i, j), entry in _entries(name, value):
-        yield from named_lines(write, f"{_SYMBOL.get(name, name)}_{i}{j}", entry)
-
-
-def _sum_lines(write: Typesetter, e: Expr) -> list[str]:
-    return write.text_lines(write.terms(e))
-
-
-def _entries(name: str, value: MatrixBase) -> Iterator[tuple[tuple[str, str], Expr]]:
-    """Yield ((row, column), entry) of the nonzero entries, from 1; of D the upper half only."""
-    comma = "," if value.rows > 9 else ""
-    for i in range(value.rows):
-        for j in range(value.cols):
-            if value[i, j] != 0 and not (name == "D" and j < i):
-                yield (str(i + 1), f"{comma}{j + 1}" if value.cols > 1 else ""), value[i, j]
-
-
-def _outputs(system: System) -> list[tuple[str, Expr]]:
-    """Return the outputs as (name, formula) with all definitions substituted."""
-    known = resolve_definitions(system.definitions)
-    known |= {c.multiplier: sympy.Symbol(f"lambda_{c.name}", real=True) for c in system.constraints}
-    return [(o.name, o.formula.xreplace(known)) for o in system.outputs]
-
-
-# --- LaTeX ----------------------------------------------------------------------------------------
-
-
-def write_latex(equations: Equations) -> str:
-    """Return the equations as LaTeX: align* environments of the package amsmath.
-
-    The equations of motion come first, then the energies, matrices and outputs.
-    """
-    return "\n".join(
-        r"\begin{align*}" + f"\n{body}\n" + r"\end{align*}"
-        for body in _environment_bodies(equations)
-    )
-
-
-def _environment_bodies(equations: Equations) -> list[str]:
-    r"""Return the LaTeX between \begin{align*} and \end{align*} of each environment.
-
-    Each text has about MAX_ENVIRONMENT_LENGTH characters at most.
-    """
-    results: list[str] = []
-    for lines in latex_lines(equations):
-        results.append("")
-        for line in lines:
-            if len(results[-1]) > MAX_ENVIRONMENT_LENGTH and not line.startswith(CONTINUATION):
-                results.append("")
-            results[-1] += (" \\\\\n" if results[-1] else "") + line
-    return results
-
-
-def latex_lines(equations: Equations) -> tuple[list[str], list[str]]:
-    """Return the equations as a pair of lists of LaTeX lines.
-
-    The first list contains the equations of motion with constraints and abbreviations. The second
-    contains all other formulas: energies, matrices and outputs. A line that continues the previous
-    one begins with CONTINUATION.
-    """
-    system, write = equations.system, Typesetter(equations.system)
-    motion = []
-    for left, force in zip(equations.left, equations.right, strict=True):
-        terms = [write.term(a, b) for a, b in _flat(left)]
-        first, *more = write.latex_lines(terms, _terms(write, force))
-        motion += [f"  & {first}", *(CONTINUATION + line for line in more)]
-    for zero in equations.zero:
-        first, *more = write.latex_lines(write.terms(zero), [])
-        motion += [f"  & {first}", *(CONTINUATION + line for line in more)]
-    for name, value in equations.named:
-        motion += latex_sum(write, tex(name.name), value)
-    lines = []
-    for name, value in _values(equations).items():
-        symbol = _LATEX.get(name, name)
-        if isinstance(value, MatrixBase):
-            if write.text(write.sort_expression(value)).width() <= WIDE:
-                lines.append(f"  {symbol} &= {write.latex(write.sort_expression(value))}")
-                continue
-            for (i, j), entry in _entries(name, value):
-                lines += latex_sum(write, f"{symbol}_{{{i}{j}}}", entry)
-        else:
-            lines += latex_sum(write, symbol, value)
-    for name, formula in _outputs(system):
-        lines += latex_sum(write, tex(name), formula)
-    return motion, lines
+    implied = ", implied by others, its multiplier 0" * c.redundant
+    return f"{c.name}: of {'positions' if c.holonomic else 'rates'}{implied}"
 
 
 # --- Python ---------------------------------------------------------------------------------------
@@ -694,6 +588,11 @@ class _Exact(StrPrinter):  # type: ignore[misc]
     def _print_Symbol(self, one: sympy.Symbol) -> str:
         return self.names.get(one.name, one.name)
 
+    def _print_Function(self, call: Expr) -> str:
+        if isinstance(call, DefinedFunction):  # SymPy does not have it
+            return f"({self._print(call.exact)})"
+        return str(super()._print_Function(call))
+
 
 def write_python(equations: Equations) -> str:
     """Return Python source code that defines the equations as SymPy matrices and expressions.
@@ -710,8 +609,9 @@ def write_python(equations: Equations) -> str:
         *(p.symbol for p in system.parameters),
         t,
     ]
-    values = _values(equations)
-    called = {f.func.__name__ for e in (*values.values(), *equations.right) for f in _functions(e)}
+    values = {name: each.right for name, each in list_quantities(equations).items()}
+    formulas = (*values.values(), *equations.right)
+    called = {f.func.__name__ for e in formulas for f in e.atoms(Application)}
     reserved = {"Matrix", "Eq", "Rational", "symbols", "exp", "sqrt", *called}
     variables = {s.name: s.name for s in symbols}
     for name in variables.keys() & reserved:
@@ -736,7 +636,3 @@ def write_python(equations: Equations) -> str:
     pairs = ", ".join(f"Eq({written(e.lhs)}, {written(e.rhs)})" for e in equations.scalar)
     lines.append(f"{'scalar_' if 'scalar' in taken else 'scalar'} = [{pairs}]")
     return "\n".join(lines)
-
-
-def _functions(value: Expr | MatrixBase) -> set[Expr]:
-    return value.atoms(Application)  # type: ignore[no-any-return]

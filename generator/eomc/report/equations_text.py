@@ -17,29 +17,30 @@ from sympy import Expr
 from eomc.base.errors import EomcError
 from eomc.derive import lagrange
 from eomc.model.hybrid import with_constant_parameters
-from eomc.model.rational import Vector
 from eomc.model.symbols import needed_definitions
 from eomc.model.system import System, t
-from eomc.model.tree import Link, Tree
+from eomc.model.tree import Link, Tree, Vector
 from eomc.program import program
 from eomc.program.routes import ROUTES
-from eomc.report import equations
 from eomc.report.equations import (
     constraint_note,
     derive,
     equation_form,
     right_hand_side,
     title_line,
+    write_python,
 )
 from eomc.report.typeset import (
     CONTINUATION,
     WIDE,
+    Equation,
     Typesetter,
-    latex_sum,
-    named_lines,
+    align,
     section,
     shorten_fractions,
     wrap,
+    write_latex,
+    write_text,
 )
 from eomc.runtime.labels import tex
 
@@ -79,8 +80,8 @@ def write_equations(system: System, form: str = "text") -> str:
         system = with_constant_parameters(system)
         return describe_in_latex(system) if form == "latex" else describe(system)
     if form == "python":
-        return equations.write_python(derived)
-    return equations.write_latex(derived.set_out) if form == "latex" else str(derived)
+        return write_python(derived)
+    return write_latex(derived.set_out.groups) if form == "latex" else str(derived)
 
 
 # --- large systems as text ------------------------------------------------------------------------
@@ -100,19 +101,11 @@ def describe(system: System) -> str:
     ]
     if system.tree is not None:
         parts.append(_recursion(system.tree, write))
-    known = _shown_definitions(system)
-    if known is not None and (known or _energies(system)):
-        section_lines: list[str] = []
-        for name, e in [*((str(s), e) for s, e in known), *_energies(system)]:
-            section_lines += named_lines(write, name, e)
-        parts.append(section("energies, over definitions; a dot is d/dt", section_lines))
-    if system.constraints:
-        section_lines = []
-        for c in system.constraints:
-            if known is not None:
-                section_lines += write.text_lines(write.terms(c.formula), [])
-            section_lines += constraint_note(c)
-        parts.append(section("constraints", section_lines))
+    listed = _list_equations(system, write)
+    if listed is not None:
+        parts += write_text(listed)
+    elif system.constraints:
+        parts.append(section("constraints", [*map(constraint_note, system.constraints)]))
     return "\n\n".join([*parts, "What computes them:", tabulate_costs(system)])
 
 
@@ -129,19 +122,37 @@ def _recursion(tree: Tree, write: Typesetter) -> str:
     ]
     for link in tree.links:
         parent = "the world" if link.parent < 0 else tree.links[link.parent].name
-        how = f"{'turns about' if link.turns else 'slides along'} {'xyz'[link.axis]}"
+        ways = (link.angular, "turns about"), (link.linear, "slides along")
+        how = f"{' and '.join(way for x, way in ways if x != 0)} {'xyz'[link.axis]}"
         by = str(write.text(write.sort_expression(link.q))).strip()
         lines.append(f"{link.name} on {parent}: {how} by {by if len(by) <= 40 else '...'}")
     return section(f"Newton and Euler's recursion over {len(tree.links)} elementary joints", lines)
 
 
-def _shown_definitions(system: System) -> list[tuple[sympy.Symbol, Expr]] | None:
-    """Return the definitions that the shown formulas depend on; None if they are too many."""
-    applied = (e for pair in system.applied for e in pair)
-    shown = [*(c.formula for c in system.constraints), *applied, system.dissipation, *system.forces]
-    shown += [e for _, e in _energies(system)]
+def _list_equations(system: System, write: Typesetter) -> list[Equation] | None:
+    """Return energies, forces and constraints over their definitions; None if these are too many.
+
+    The generalized forces are Q - ∂R/∂q̇ + the sum of ∂y_k/∂q F_k.
+    """
+    energies = _energies(system)
+    forces = [("R", system.dissipation)] if system.dissipation != 0 else []
+    forces += [(f"Q_{i}", force) for i, force in enumerate(system.forces, 1) if force != 0]
+    for k, pair in enumerate(system.applied, 1):
+        forces += zip((f"y_{k}", f"F_{k}"), pair, strict=True)
+    shown = [*(c.formula for c in system.constraints), *(e for _, e in (*forces, *energies))]
     known = needed_definitions(system.definitions, shown)
-    return known if len(known) <= MAX_DEFINITIONS else None
+    if len(known) > MAX_DEFINITIONS:
+        return None
+    titles = (
+        ("definitions; a dot is d/dt", known),
+        ("energies, over definitions", [(sympy.Symbol(name), e) for name, e in energies]),
+        ("generalized forces, τ = Q - ∂R/∂q̇ + the sum of ∂y/∂q F",
+         [(sympy.Symbol(name), e) for name, e in forces]),
+    )  # fmt: skip
+    listed = [Equation(title, s, e, write) for title, pairs in titles for s, e in pairs]
+    for c in system.constraints:
+        listed.append(Equation("constraints", c.formula, sympy.S.Zero, write, constraint_note(c)))
+    return listed
 
 
 def _energies(system: System) -> list[tuple[str, Expr]]:
@@ -149,7 +160,8 @@ def _energies(system: System) -> list[tuple[str, Expr]]:
     linear = [("U", system.linear_potential)] if system.linear_potential != 0 else []
     if system.tree is None:
         return [("K", system.kinetic), ("P", system.potential), *linear]
-    remaining = (("K'", system.tree.other_kinetic), ("P'", system.tree.other_potential), *linear)
+    tree = system.tree
+    remaining = (("K_prime", tree.other_kinetic), ("P_prime", tree.other_potential), *linear)
     return [(name, e) for name, e in remaining if e != 0]
 
 
@@ -161,14 +173,7 @@ def describe_in_latex(system: System) -> str:
 
     It consists of align* environments of the package amsmath.
     """
-    return "\n".join(
-        r"\begin{align*}" + f"\n{body}\n" + r"\end{align*}" for body in _environment_bodies(system)
-    )
-
-
-def _environment_bodies(system: System) -> list[str]:
-    r"""Return the LaTeX between \begin{align*} and \end{align*} of each environment of the text."""
-    write, tree, known = Typesetter(system), system.tree, _shown_definitions(system)
+    write, tree = Typesetter(system), system.tree
     parts = [_latex_form(system)]
     if tree is not None:
         parts[0] += _latex_recursion(tree, write)
@@ -177,9 +182,10 @@ def _environment_bodies(system: System) -> list[str]:
             links[k : k + LINES_PER_ENVIRONMENT]
             for k in range(0, len(links), LINES_PER_ENVIRONMENT)
         ]
-    if known is not None:
-        parts.append(_latex_rest(system, known, write))
-    return [" \\\\\n".join(lines) for lines in parts if lines]
+    if (listed := _list_equations(system, write)) is not None:
+        parts.append(_latex_forces(system))
+        parts[-1] += (line for each in listed for line in each.latex_lines())
+    return align(parts)
 
 
 def _latex_form(system: System) -> list[str]:
@@ -260,11 +266,14 @@ def _latex_link(k: int, tree: Tree, write: Typesetter) -> list[str]:
     n, axis = k + 1, "xyz"[link.axis]
     r, R = _vector(link.offset, write), _rotation(link, write)
     turn = rf"R_{{{axis}}}(s_{{{n}}})"
-    if link.turns:
+    e, linear = f"e_{{{axis}}}", "" if link.linear == 1 else f"{_formula(link.linear, write)} "
+    if link.linear.is_Add:
+        linear = rf"\left({linear}\right) "
+    if link.linear != 0:
+        r += f" + {R or ''} {linear}{e} s_{{{n}}}"
+    if link.angular != 0:
         R = f"{R} {turn}" if R else turn
-    else:
-        r += f" + {R or ''} e_{{{axis}}} s_{{{n}}}"
-    S = f"(e_{{{axis}}}, 0)" if link.turns else f"(0, e_{{{axis}}})"
+    S = f"({e if link.angular else 0}, {linear + e if link.linear else 0})"
     lines = [
         rf"  & \text{{{_escape(f'{link.name} on {parent}')}}}, "
         rf"\; k = {n}, \; p = {link.parent + 1}: \quad "
@@ -285,30 +294,14 @@ def _latex_link(k: int, tree: Tree, write: Typesetter) -> list[str]:
     return lines
 
 
-def _latex_rest(
-    system: System, known: list[tuple[sympy.Symbol, Expr]], write: Typesetter
-) -> list[str]:
-    """Return the energies, friction, forces and constraints over their definitions."""
-    lines = [line for s, e in known for line in latex_sum(write, write.latex(s), e)]
-    for name, e in _energies(system):
-        lines += latex_sum(write, name, e)
+def _latex_forces(system: System) -> list[str]:
+    """Return the line that says of what the generalized forces consist, in a list."""
+    if not _has_forces(system):
+        return []
     friction = f" - {_slope('R', DQ)}" * (system.dissipation != 0)
-    applied_forces = "".join(
-        f" + {_slope(f'y_{{{k}}}', 'q')} F_{{{k}}}" for k in range(1, len(system.applied) + 1)
-    )
-    if _has_forces(system):
-        lines.append(rf"  \tau &= Q{friction}{applied_forces}")
-    if friction:
-        lines += latex_sum(write, "R", system.dissipation)
-    for i, force in enumerate(system.forces, 1):
-        if force != 0:
-            lines += latex_sum(write, f"Q_{{{i}}}", force)
-    for k, (y, force) in enumerate(system.applied, 1):
-        lines += latex_sum(write, f"y_{{{k}}}", y) + latex_sum(write, f"F_{{{k}}}", force)
-    for c in system.constraints:
-        first, *more = write.latex_lines(write.terms(c.formula), [])
-        lines += [f"  & {first}", *(CONTINUATION + line for line in more)]
-    return lines
+    count = range(1, len(system.applied) + 1)
+    applied = "".join(f" + {_slope(f'y_{{{k}}}', 'q')} F_{{{k}}}" for k in count)
+    return [rf"  \tau &= Q{friction}{applied}"]
 
 
 def _slope(numerator: str, denominator: str) -> str:

@@ -1,28 +1,36 @@
-"""Text, JSON and HTML of the report of `cost_of_digits`."""
+"""Text, JSON and HTML of the report of `cost_of_digits`, with an overview of the scene."""
 
 from __future__ import annotations
 
 import io
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
 from eomc.base import texts
-from eomc.emit.render import environment
+from eomc.base.errors import EomcError
+from eomc.emit.common.templates import environment
+from eomc.model.system import Coordinate, Input, Output, Parameter, System
+from eomc.report import equations, equations_text
 from eomc.report.cost_of_digits import (
     DIGITS,
     LARGE_CONDITION,
     USELESS_ERROR,
     WorkPrecisionPoint,
     WorkPrecisionReport,
+    build_variant,
 )
-from eomc.report.overview import Overview
-from eomc.report.plot import to_svg, without_pictures
+from eomc.report.plot import make_figure, to_svg, without_pictures
+from eomc.report.style import html_name
+from eomc.report.typeset import write_mathml
 
+Row = tuple[Markup, str, Markup, Markup]  # name, value, unit, note
+Lines = Sequence[tuple[bool, Markup]]  # (True if the line continues the previous one, MathML)
 EXPLAINED = """\
 Usable h: the largest measured with an error below 1 all along. Stable to: by the eigenvalues of
 the linearised motion; steps up to it let no difference grow, though their errors may add up to
@@ -210,6 +218,104 @@ def _for_json(value: Any) -> Any:
     if isinstance(value, (list, tuple, np.ndarray)):
         return [_for_json(inside) for inside in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+@dataclass(frozen=True)
+class Overview:
+    """Data for the overview in the template report/report.html.jinja, escaped for HTML.
+
+    Attributes
+    ----------
+    note
+        Note of the scene.
+    coordinates, parameters, inputs, outputs
+        Rows of the tables of these quantities, each with name, value, unit and note.
+    equations, rest
+        Lines of the equations of motion, and lines of all other formulas. Each is a pair (True if
+        the line continues the previous one, MathML of the line).
+    text
+        Plain text that replaces equations that are too long or can't be converted to MathML.
+    motion, caption
+        Figure of the motion as SVG (empty without matplotlib), and its caption.
+    """
+
+    note: Markup
+    coordinates: Sequence[Row]
+    parameters: Sequence[Row]
+    inputs: Sequence[Row]
+    outputs: Sequence[Row]
+    equations: Lines
+    rest: Lines
+    text: Markup
+    motion: Markup
+    caption: str
+
+
+def describe_scene(system: System, report: WorkPrecisionReport, root: Path) -> Overview:
+    """Return the overview of a scene: its tables, its equations and a figure of its motion.
+
+    The figure shows the fastest run of the report that has six correct digits, or else the most
+    accurate run. root: build directory.
+    """
+    first, rest, text = _equations(system)
+    motion, caption = _motion(system, report, root)
+    return Overview(
+        note=Markup(texts.html(texts.flat(system.note))),
+        coordinates=[_row(c, f"{c.start:.6g}", f"{c.rate:.6g}") for c in system.coordinates],
+        parameters=[_row(p, f"{p.value:.6g}") for p in system.parameters],
+        inputs=[_row(i, "") for i in system.inputs],
+        outputs=[_row(o, "") for o in system.outputs],
+        equations=first,
+        rest=rest,
+        text=Markup("\n").join(map(texts.html, text.splitlines())),
+        motion=motion,
+        caption=caption,
+    )
+
+
+def _equations(system: System) -> tuple[Lines, Lines, str]:
+    """Return the equations of motion and the other formulas as MathML, or both as text.
+
+    They are returned as text if latex2mathml is not installed or if the equations are too long.
+    """
+    try:
+        derived = equations.derive(system)
+    except EomcError:
+        return [], [], equations_text.describe(system)
+    try:
+        first, rest = map(write_mathml, derived.set_out.groups)
+    except EomcError:
+        return [], [], str(derived)
+    return first, rest, ""
+
+
+def _row(entry: Coordinate | Parameter | Input | Output, *numbers: str) -> Row:
+    name = Markup(html_name(entry.name))
+    unit, note = (Markup(texts.html(texts.flat(x))) for x in (entry.unit, entry.note))
+    return name, ", ".join(numbers), unit, note
+
+
+def _motion(system: System, report: WorkPrecisionReport, root: Path) -> tuple[Markup, str]:
+    if without_pictures():
+        return Markup(""), ""
+    min_rows = 1_000  # so that curves look smooth
+    best = report.best(6) or report.finest
+    module, _ = build_variant(
+        system, [p.method for p in report.lines], root / system.name / "report"
+    )
+    finer = max(1, math.ceil(min_rows / best.steps))
+    if best.adaptive:
+        run = module.simulate(tol=best.tol, duration=report.duration).curve_run
+        caption = f"By steps that fit a tolerance of {best.tol:.0e}"
+    else:
+        h, steps = best.h / finer, best.steps * finer
+        run = module.simulate(h=h, steps=steps, method=best.method)
+        caption = f"By {best.method}, h = {run.h:.3g} s"
+    balance = run.balance().words if run.model.functions.has_power else ""
+    figure = make_figure(system, run, " ", balance=balance)
+    if best.adaptive or finer == 1:
+        caption += f", within {best.along:.1g} of the reference solution"
+    return to_svg(figure), caption + "."
 
 
 def write_page(report: WorkPrecisionReport, overview: Overview | None = None) -> str:

@@ -7,8 +7,7 @@ used.
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,12 +17,12 @@ from numpy.typing import NDArray
 
 from eomc.base import texts
 from eomc.base.errors import EomcError, writing
-from eomc.model.system import Coordinate, System
+from eomc.model.system import System
 from eomc.report import picture as pictures
-from eomc.report.style import COLOURS, INK, format_axes
+from eomc.report.style import COLOURS, INK, choose_colours, format_axes
 from eomc.runtime.atomic_write import atomic_write
-from eomc.runtime.labels import mathtext, rate_unit, with_unit
-from eomc.runtime.plot import Curve, against, grouped, wrapped
+from eomc.runtime.labels import with_unit
+from eomc.runtime.plot import MAX_ROWS, Curve, Source, against, grouped
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,70 +32,10 @@ Array = NDArray[np.float64]
 
 SUFFIXES = (".png", ".svg", ".pdf")
 
-MAX_SAMPLES = 20_000  # rows of a run that are drawn
-
-
-@dataclass(frozen=True)
-class RunCurves:
-    """The quantities of a run that its figure shows, at n times.
-
-    Attributes
-    ----------
-    t : array (n,)
-        Times in s.
-    q, qd : arrays (n, nq)
-        Coordinates and velocities.
-    energy : array (n,)
-        Total energy K + P.
-    jacobi : array (n,) or None
-        Jacobi's integral, if it differs from the energy.
-    outputs, inputs : mappings from names to arrays (n,)
-        Outputs and inputs to plot.
-    balance : str
-        The energy balance in words, for the heading of the plot of the energy; "" for none.
-    """
-
-    t: Array
-    q: Array
-    qd: Array
-    energy: Array
-    jacobi: Array | None = None
-    outputs: Mapping[str, Array] = field(default_factory=dict)
-    inputs: Mapping[str, Array] = field(default_factory=dict)
-    balance: str = ""
-
-    @classmethod
-    def from_run(cls, run: Any, balance: str = "") -> RunCurves:
-        """Return the curves of a run. An adaptive run with few rows is interpolated.
-
-        balance: the energy balance of the run in words.
-        """
-        drawn, model = run.curve_run, run.model
-        jacobi = drawn.jacobi if model.functions.has_jacobi else None
-        inputs = dict(zip(model.info.inputs, drawn.u.T, strict=True)) if model.info.inputs else {}
-        return cls(drawn.t, drawn.q, drawn.qd, drawn.energy, jacobi, drawn.outputs, inputs, balance)
-
-    def thin(self, every: int) -> RunCurves:
-        """Return only the rows 0, `every`, 2 `every`, ... as numbers of double precision."""
-
-        def rows(values: Array) -> Array:
-            return np.asarray(values, dtype=float)[::every]
-
-        return replace(
-            self,
-            t=rows(self.t),
-            q=rows(self.q),
-            qd=rows(self.qd),
-            energy=rows(self.energy),
-            jacobi=None if self.jacobi is None else rows(self.jacobi),
-            outputs={name: rows(values) for name, values in self.outputs.items()},
-            inputs={name: rows(values) for name, values in self.inputs.items()},
-        )
-
 
 def write_figure(
-    system: System, run: RunCurves, path: str | Path, *, title: str | None = None,
-    wrap: bool = False,
+    system: System, run: Any, path: str | Path, *, title: str | None = None,
+    wrap: bool = False, balance: str = "",
 ) -> None:  # fmt: skip
     """Write the figure of a run to a file.
 
@@ -104,14 +43,16 @@ def write_figure(
     ----------
     system : System
         The simulated system, with the names and units of its quantities.
-    run : RunCurves
-        The quantities of the run.
+    run : Trajectory
+        The run. An adaptive run with few rows is interpolated.
     path : path
         The suffix determines the format: .png, .svg or .pdf.
     title : str, optional
         Heading in place of the title of the system.
     wrap : bool, optional
         Show angles in the range from -pi to pi.
+    balance : str, optional
+        The energy balance of the run in words, for the heading of the plot of the energy.
 
     Raises
     ------
@@ -121,7 +62,7 @@ def write_figure(
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
         raise EomcError(f"{path}: a picture is written as {', '.join(SUFFIXES)}: end its name so")
-    result = make_figure(system, run, title, wrap)
+    result = make_figure(system, run, title, wrap, balance)
     import matplotlib
 
     undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(suffix)
@@ -152,7 +93,7 @@ def to_svg(figure: Figure) -> Markup:
 
 
 def make_figure(
-    system: System, run: RunCurves, title: str | None = None, wrap: bool = False
+    system: System, run: Any, title: str | None = None, wrap: bool = False, balance: str = ""
 ) -> Figure:
     """Return the matplotlib figure of a run; the arguments are those of `write_figure`.
 
@@ -163,38 +104,21 @@ def make_figure(
     except ImportError:
         raise EomcError("drawing needs matplotlib: pip install matplotlib") from None
     with matplotlib.rc_context({"text.usetex": False}):  # a title and units are no LaTeX
-        every = max(len(run.t) // MAX_SAMPLES, 1)
-        return _draw(system, run.thin(every), title or system.title or system.name, wrap)
+        return _draw(system, Source(run, wrap), title or system.title or system.name, balance)
 
 
-def _draw(system: System, run: RunCurves, title: str, wrap: bool) -> Figure:
+def _draw(system: System, source: Source, title: str, balance: str) -> Figure:
     from matplotlib.figure import Figure
 
-    t, q, qd = run.t, run.q, run.qd
-    moving = [
-        (
-            Curve(c.name, wrapped(q[:, i]), c.unit, "angles")
-            if wrap and c.unit == "rad"
-            else Curve(c.name, q[:, i], c.unit, "coordinates"),
-            _rate(c, qd[:, i]),
-        )
-        for i, c in enumerate(system.coordinates)
-    ]
-    rates = {c.name: rate for c, rate in moving}
+    run, t = source.run, source.t
+    groups = grouped([source.curve(c.name) for c in system.coordinates])
     modes = (system.coordinates[m.at].name for m in system.modes)
     discrete = {*system.discrete, *modes}  # between jumps
-    groups = grouped([c for c, _ in moving])
-    below = grouped(
-        [
-            Curve(x.name, values[x.name], x.unit, kind)
-            for kind, some, values in (
-                ("inputs", system.inputs, run.inputs), ("outputs", system.outputs, run.outputs)
-            )
-            for x in some
-            if x.name in values
-        ]
-    )  # fmt: skip
-    picture = pictures.make_picture(system, t, q, qd)
+    others = (*system.inputs, *system.outputs)
+    below = grouped([source.curve(x.name) for x in others])
+    every = max(len(t) // MAX_ROWS, 1)
+    q, qd = (np.asarray(x, float)[::every] for x in (run.q, run.qd))
+    picture = pictures.make_picture(system, t[::every], q, qd)
     rows = len(groups) + len(below) + 1
     height = min(2.1 * rows + 0.5, max(9, 1.5 * rows))
     result = Figure(figsize=(12, height), layout="constrained")
@@ -205,7 +129,7 @@ def _draw(system: System, run: RunCurves, title: str, wrap: bool) -> Figure:
 
     first: Axes | None = None
     for row, group in enumerate(groups):
-        going = [rates[c.name] for c in group if c.name not in discrete]
+        going = [source.curve(f"{c.name}_dot") for c in group if c.name not in discrete]
         for column, curves in enumerate((group, going) if going else (group,)):
             place = grid[row, column] if going else grid[row, :2]
             axes = result.add_subplot(place, sharex=first)
@@ -215,7 +139,7 @@ def _draw(system: System, run: RunCurves, title: str, wrap: bool) -> Figure:
         _curves(result.add_subplot(grid[row, :2], sharex=first), t, group)
     axes = result.add_subplot(grid[-1, :2], sharex=first)
     unit = "J" if any(c.unit for c in system.coordinates) else ""
-    _energy(axes, run, unit)
+    _energy(axes, source, unit, balance)
     axes.set_xlabel("$t$ (s)")
     if len(t) > 1 and t[-1] > t[0]:
         axes.set_xlim(t[0], t[-1])  # and of all that share it
@@ -228,12 +152,8 @@ def _draw(system: System, run: RunCurves, title: str, wrap: bool) -> Figure:
 # --- against time ---------------------------------------------------------------------------------
 
 
-def _rate(c: Coordinate, values: Array) -> Curve:
-    return Curve(c.name, values, rate_unit(c.unit, True), "velocities", mathtext(c.name, True))
-
-
 def _curves(axes: Axes, t: Array, curves: Sequence[Curve]) -> None:
-    axes.set_prop_cycle(color=_colours(len(curves)))
+    axes.set_prop_cycle(color=choose_colours(len(curves)))
     lines = against(axes, t, curves)
     format_axes(axes)
     if len(lines) > 1:
@@ -242,13 +162,17 @@ def _curves(axes: Axes, t: Array, curves: Sequence[Curve]) -> None:
                     bbox_to_anchor=(1.0, 0.5), handlelength=1.0, borderaxespad=0.2)  # fmt: skip
 
 
-def _energy(axes: Axes, run: RunCurves, unit: str) -> None:
+def _energy(axes: Axes, source: Source, unit: str, words: str) -> None:
     """Plot E, or E - E(0) if the energy is nearly conserved and E would be a straight line.
 
     If Jacobi's integral J differs from the energy, both are plotted relative to their initial
-    values.
+    values. words: the energy balance, for the heading.
     """
-    t, energy, jacobi, words = run.t, run.energy, run.jacobi, run.balance
+    every = max(len(source.t) // MAX_ROWS, 1)
+    t, energy = source.t[::every], np.asarray(source.run.energy, float)[::every]
+    jacobi = None
+    if "jacobi" in source.run.column_names:
+        jacobi = np.asarray(source.run.jacobi, float)[::every]
     change = energy - energy[:1]
     drift = float(np.max(np.abs(change), initial=0.0))
     conserved = jacobi is not None or drift <= 0.01 * float(np.max(np.abs(energy), initial=0.0))
@@ -281,11 +205,3 @@ def _quantity(value: float, unit: str, digits: int = 4) -> str:
         mantissa, exponent = f"{value:.{digits}g}".split("e")
         text = rf"${mantissa}\times10^{{{int(exponent)}}}$"
     return f"{text} {texts.figure(unit)}".rstrip()
-
-
-def _colours(n: int) -> list[Any]:
-    if n <= len(COLOURS):
-        return list(COLOURS[:n])
-    import matplotlib
-
-    return list(matplotlib.colormaps["viridis"](np.linspace(0.0, 0.9, n)))

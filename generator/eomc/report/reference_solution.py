@@ -15,12 +15,14 @@ import shutil
 import subprocess
 import tempfile
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from decimal import Decimal
+from decimal import Decimal, localcontext
 from fractions import Fraction
 from functools import cache, cached_property
+from operator import mul
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import mpmath
 import numpy as np
@@ -31,13 +33,14 @@ from eomc import pipeline
 from eomc.base.errors import EomcError, FolderError
 from eomc.derive import lagrange
 from eomc.emit import portable
-from eomc.emit.c_expression import QUAD
-from eomc.emit.c_names import Target, rename_for_c
-from eomc.emit.functions import SceneFunctions
-from eomc.emit.render import show
+from eomc.emit.common.c_expression import QUAD
+from eomc.emit.common.c_names import Target, rename_for_c
+from eomc.emit.common.functions import SceneFunctions
+from eomc.emit.common.templates import show
+from eomc.integrators.tableaux import gauss
 from eomc.model.algebra import compile_function
 from eomc.model.hybrid import with_constant_parameters
-from eomc.model.nonsmooth import nonsmooth_functions
+from eomc.model.mechanics import nonsmooth_functions
 from eomc.model.system import System
 from eomc.model.system import t as time_symbol
 from eomc.program import program
@@ -56,20 +59,6 @@ MAX_PLAIN_SECONDS = 2.0  # computing time of the motion in mpmath
 PLAIN_DIGITS = 40
 PLAIN_STATES = 5
 MIN_PLAIN_DIGITS = 26.0  # of accelerations: with fewer, the equations differ
-
-
-@dataclass(frozen=True)
-class ProgramView:
-    """Data for the template report/reference_solution.c: a simulation in quadruple precision.
-
-    parameters: number of parameters. call: C call of the accelerations.
-    """
-
-    TEMPLATE: ClassVar[str] = "report/reference_solution.c"
-    prefix: str
-    PREFIX: str
-    parameters: int
-    call: str
 
 
 @dataclass(frozen=True)
@@ -217,12 +206,15 @@ def _compile(system: System, folder: Path) -> Path:
     """Compile the scene's C in __float128 with the integrator; return the executable."""
     system = replace(system, run=replace(system.run, methods=("rk4",), batch=False, real="double"))
     lowered = rename_for_c(program.build(lagrange.derive(system)))[0]
-    shown = portable.files(lowered, show, QUAD)
+    shown = portable.files(lowered, QUAD)
     functions = SceneFunctions(Target(lowered, QUAD))
     call = functions.acceleration.function.call(
         qdd="a", u="NULL", p=f"(const {system.name}_params *)p"
     )
-    main = show(ProgramView(system.name, system.name.upper(), len(system.parameters), call))
+    main = show(
+        "report/reference_solution.c", prefix=system.name, PREFIX=system.name.upper(),
+        parameters=len(system.parameters), call=call,
+    )  # fmt: skip
     for name, text in (*shown.items(), ("quad.c", main)):
         (folder / name).write_text("#include <quadmath.h>\n" + text, encoding="utf-8")
     missing = (
@@ -278,37 +270,23 @@ def _run(
 def gauss_coefficients(stages: int) -> str:
     """Return the coefficients of the Gauss method with `stages` stages as text, to 40 digits.
 
-    The text contains the number of stages, c, A, A A, b, b A and weights, separated by blanks.
-    Nodes are the zeros of the Legendre polynomial P_s on [0, 1], a_ij = int_0^c_i l_j, by the exact
-    rule l_j = b_j sum_k (2k + 1) P_k(c_j) P_k (Hairer & Wanner, Solving ODEs II, sec. IV.5). The
+    The text contains the number of stages, c, A, A A, b, b A and weights, separated by blanks. The
     weights (2k + 1) b_j P_k(c_j) give the Legendre coefficients of the accelerations.
     """
-    with mpmath.workdps(60):
-        n = stages
-        x = [
-            mpmath.findroot(lambda z: mpmath.legendre(n, z), mpmath.mpf(float(near)))
-            for near in np.polynomial.legendre.leggauss(n)[0]
-        ]
-        P = [[mpmath.legendre(k, z) for z in x] for k in range(n + 1)]
-        # P_n'(x) = n P_{n-1}(x)/(1 - x^2) at a zero of P_n; weights on [0, 1]
-        b = [(1 - z**2) / (n * P[n - 1][j]) ** 2 for j, z in enumerate(x)]
-        c = [(1 + z) / 2 for z in x]
+    method = gauss(stages, "reference")
+    with localcontext(prec=50):
+        c, b, *A = (decimals(row) for row in (method.c, method.b, *method.a))
+        columns = [*zip(*A, strict=True)]
+        products = [sum(map(mul, row, column)) for row in (*A, b) for column in columns]
+        weights = [x for k in range(stages) for x in decimals(method.legendre(k))]
+        AA, bA = products[: stages**2], products[stages**2 :]
+        numbers = [*c, *(x for row in A for x in row), *AA, *b, *bA, *weights]
+        return " ".join([f"{stages}", *(f"{x:.40e}" for x in numbers)])
 
-        def integral(k: int, i: int) -> Any:
-            """Return the integral of P_k(2 tau - 1) from 0 to c_i."""
-            if k == 0:
-                return c[i]
-            return (P[k + 1][i] - P[k - 1][i]) / (2 * (2 * k + 1))
 
-        A = mpmath.matrix(n, n)
-        for i in range(n):
-            for j in range(n):
-                A[i, j] = b[j] * sum((2 * k + 1) * P[k][j] * integral(k, i) for k in range(n))
-        AA, row = A * A, mpmath.matrix([b])
-        bA = row * A
-        weights = [(2 * k + 1) * b[j] * P[k][j] for k in range(n) for j in range(n)]
-        everything = [mpmath.mpf(n), *c, *A, *AA, *b, *bA, *weights]
-        return " ".join(mpmath.nstr(each, 40, min_fixed=0, max_fixed=0) for each in everything)
+def decimals(numbers: Iterable[Fraction]) -> list[Decimal]:
+    """Return fractions as decimal numbers."""
+    return [Decimal(x.numerator) / x.denominator for x in numbers]
 
 
 def _agreement(one: Text, other: Text) -> Vector:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.model.system import System
 from eomc.report.drawing import Drawing, draw_instances, draw_mechanism
+from eomc.runtime.plot import Curve
 from eomc.runtime.plot import Source as Quantities
 
 Array = NDArray[np.float64]
@@ -27,29 +28,14 @@ MAX_INSTANCES = 24  # that can be told apart in one drawing
 MAX_KEY_PARAMETERS = 2  # that differ between the instances, in the key
 
 
-@dataclass(frozen=True)
-class TimeSeries:
-    """A curve against time in a panel of an animation: its name and its values.
-
-    The values belong to the stored times that the animation shows. stairs: True for an input that
-    is held constant from one time to the next (zero-order hold), which is drawn in steps.
-    """
-
-    name: str
-    values: Array
-    stairs: bool = False
-
-
-@dataclass(frozen=True)
-class Panel:
+class Panel(NamedTuple):
     """A panel of an animation: curves with the same unit that share one pair of axes.
 
-    name: name of the quantity, if all curves show one quantity for different instances (runs of a
-    batch); else "".
+    The values of the curves belong to the stored times that the animation shows. name: name of the
+    quantity, if all curves show one quantity for different instances (runs of a batch); else "".
     """
 
-    unit: str
-    lines: tuple[TimeSeries, ...]
+    curves: tuple[Curve, ...]
     name: str = ""
 
 
@@ -67,6 +53,11 @@ class Timeline:
         self.title: str = system.title or system.name
 
     @property
+    def has_stairs(self) -> bool:
+        """True if the inputs are held constant from one row to the next (zero-order hold)."""
+        return getattr(getattr(self.run, "request", None), "u", None) is not None
+
+    @property
     def curves(self) -> int:
         """Approximate number of curves in all panels."""
         return 2 * len(self.system.q) + 1
@@ -75,10 +66,16 @@ class Timeline:
         """Replace the stored states of an adaptive run by `count` interpolated ones.
 
         The new states are equidistant in time. Returns True if they were replaced; returns False
-        and changes nothing if the run has fixed steps or no duration.
+        and changes nothing if the run has fixed steps or no duration, or is a batch.
         """
         run = self.run
-        if not (hasattr(run, "resample") and len(run) > 1 and run.t[-1] > run.t[0]):
+        request = getattr(run, "request", None)
+        if (
+            request is None
+            or request.has_equal_steps
+            or np.ndim(run.q) > 2
+            or not (len(run) > 1 and run.t[-1] > run.t[0])
+        ):
             return False
         self.run = run.resample(count)
         self.t = np.asarray(self.run.t, dtype=float)
@@ -99,25 +96,20 @@ class Timeline:
         energy is the last one.
         """
         system, run = self.system, self.run
-        q = np.asarray(run.q, dtype=float)[rows]
-        lines = [(c.unit, TimeSeries(c.name, q[:, k])) for k, c in enumerate(system.coordinates)]
-        lines += [
-            (o.unit, TimeSeries(o.name, np.asarray(run.outputs[o.name], dtype=float)[rows]))
-            for o in system.outputs
-        ]
-        u = np.asarray(run.u, dtype=float)[rows] if system.inputs else np.empty((len(rows), 0))
-        has_stairs = getattr(run, "input_source", None) is not None
-        lines += [
-            (i.unit, TimeSeries(i.name, u[:, k], has_stairs)) for k, i in enumerate(system.inputs)
-        ]
-        units = dict.fromkeys(unit for unit, _ in lines)
+
+        def curves(kind: str, quantities: Sequence[Any], columns: Any) -> list[Curve]:
+            pairs = zip(quantities, columns, strict=True)
+            return [Curve(x.name, np.asarray(v, float)[rows], x.unit, kind) for x, v in pairs]
+
+        lines = curves("coordinates", system.coordinates, np.transpose(run.q))
+        lines += curves("outputs", system.outputs, [run.outputs[o.name] for o in system.outputs])
+        lines += curves("inputs", system.inputs, np.transpose(run.u) if system.inputs else ())
         separate = len(lines) <= MAX_PANELS - 1 and len(lines) <= MAX_CURVES_PER_PANEL
-        for unit in units:
-            curves = tuple(line for curve_unit, line in lines if curve_unit == unit)
-            for group in [(line,) for line in curves] if separate else [curves]:
-                yield Panel(unit, group)
+        for unit in dict.fromkeys(line.unit for line in lines):
+            group = tuple(line for line in lines if line.unit == unit)
+            yield from ([Panel((line,)) for line in group] if separate else [Panel(group)])
         known = "J" if any(c.unit for c in system.coordinates) else ""
-        yield Panel(known, (TimeSeries("energy", np.asarray(run.energy, dtype=float)[rows]),))
+        yield Panel((Curve("energy", np.asarray(run.energy, dtype=float)[rows], known, "energy"),))
 
 
 class BatchTimeline(Timeline):
@@ -129,9 +121,9 @@ class BatchTimeline(Timeline):
 
     def __init__(self, system: System, batch: Any, names: Sequence[str], chosen: Any) -> None:
         numbers = choose_instances(len(batch), chosen)
-        super().__init__(system, select_instances(batch, numbers))
+        super().__init__(system, batch.select(numbers))
         self.names = tuple(names) or self._default()
-        table = np.broadcast_to(self.run.parameter_values, (len(numbers), len(system.parameters)))
+        table = np.broadcast_to(self.run.request.p, (len(numbers), len(system.parameters)))
         self.systems = [
             system.with_parameters(
                 dict(zip(batch.model.info.parameters, map(float, row), strict=True))
@@ -169,10 +161,9 @@ class BatchTimeline(Timeline):
         """
         source = Quantities(self.run)
         for curve in map(source.curve, self.names):
-            lines = (
-                TimeSeries(n, x[rows]) for n, x in zip(self.numbers, curve.values, strict=True)
-            )
-            yield Panel(curve.unit, tuple(lines), curve.name)
+            pairs = zip(self.numbers, curve.values, strict=True)
+            lines = tuple(replace(curve, name=n, values=x[rows]) for n, x in pairs)
+            yield Panel(lines, curve.name)
 
 
 def find_system(run: Any, scene: Source | None = None) -> System:
@@ -209,7 +200,7 @@ def find_system(run: Any, scene: Source | None = None) -> System:
             f"{where}: is not the scene that {model.info.name} was built from, or has changed "
             "since: load it again with eomc.load"
         )
-    values = np.atleast_2d(run.parameter_values)[0]
+    values = np.atleast_2d(run.request.p)[0]
     return system.with_parameters(dict(zip(model.info.parameters, map(float, values), strict=True)))
 
 
@@ -237,16 +228,6 @@ def choose_instances(count: int, chosen: int | Sequence[int]) -> list[int]:
             f"instances: at most {MAX_INSTANCES} can be told apart, here {len(numbers)}"
         )
     return numbers
-
-
-def select_instances(batch: Any, numbers: Sequence[int]) -> Any:
-    """Return a copy of a batch that contains only the instances with the indices `numbers`."""
-    fields = {n: getattr(batch, n)[numbers] for n in ("q", "qd", "steps", "status_codes")}
-    for name in ("parameter_values", "row_inputs"):  # one row if all instances share it
-        values = getattr(batch, name)
-        if values is not None and len(values) > 1:
-            fields[name] = values[numbers]
-    return replace(batch, **fields)
 
 
 def _hold_last_finite(q: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Print formulas in textbook order, broken into lines, as text and as LaTeX.
+"""Print equations in textbook order, broken into lines, as text, LaTeX and MathML.
 
 In a product, masses and lengths come before coordinates, these before velocities and accelerations,
 and sines last; in a sum, accelerations come first, then velocities. Such sums and products are not
@@ -7,29 +7,37 @@ evaluated, since SymPy would sort them by name.
 
 from __future__ import annotations
 
+import re
 import textwrap
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import cache
+from itertools import groupby
 from typing import Any
 
 import sympy
-from sympy import Expr, Symbol
+from markupsafe import Markup
+from sympy import Expr, MatrixBase, Symbol
 from sympy.printing.latex import LatexPrinter
 from sympy.printing.pretty.pretty import PrettyPrinter
 from sympy.printing.pretty.pretty_symbology import pretty_symbol, pretty_use_unicode
 from sympy.printing.pretty.stringpict import prettyForm, stringPict
 from sympy.printing.str import StrPrinter
 
+from eomc.base.errors import EomcError
 from eomc.model.system import System, symbol, t
 from eomc.runtime.labels import tex
 
 MIN_DECIMAL_DENOMINATOR = 20  # smaller denominators are shown as fractions
 DOTS = ("", "\N{DOT ABOVE}", "\N{DIAERESIS}")  # appended to names of several letters
 MAX_FRACTION_PART = 10**12  # larger numerators or denominators are shown as decimals
+MIN_LONG_DECIMAL = 14  # characters of a float that no one writes, such as 2.6666666666666665
 ZERO_TOLERANCE = 1e-25  # a smaller factor is the rounding error of zero
 WIDE = 96  # columns of a line of text; also limits lines of LaTeX
 CONTINUATION = r"  & \quad "  # prefix of a line of LaTeX that continues the previous one
+MAX_ENVIRONMENT_LENGTH = 3_000  # characters of LaTeX: KaTeX accepts about a page
 
 Term = tuple[bool, Expr]  # (True if subtracted, the term without its sign)
 
@@ -38,17 +46,18 @@ class Typesetter:
     """Prints SymPy expressions over the names of a system as blocks of Unicode text or as LaTeX.
 
     Methods for sums use pairs of the type `Term`: (True if the term is subtracted, the term without
-    its sign).
+    its sign). symbols: the user's symbols by name, in place of those of the system.
     """
 
-    def __init__(self, system: System) -> None:
+    def __init__(self, system: System, symbols: Mapping[str, Expr] | None = None) -> None:
+        self._internal = {own: symbol(name) for name, own in (symbols or {}).items()}
         dotted = {c.q: (c.name, 0) for c in system.coordinates}
         dotted |= {c.qd: (c.name, 1) for c in system.coordinates}
         dotted |= {c.qdd: (c.name, 2) for c in system.coordinates}
         self._rank: dict[Symbol, tuple[int, int]] = {t: (3, 0)}
         parameters = [p.symbol for p in system.parameters]
-        for group, symbols in enumerate((parameters, [], [], system.q, system.qd, system.qdd)):
-            self._rank |= {s: (group, i) for i, s in enumerate(symbols)}
+        for group, members in enumerate((parameters, [], [], system.q, system.qd, system.qdd)):
+            self._rank |= {s: (group, i) for i, s in enumerate(members)}
         self._rates = (*system.qdd, *system.qd)
         # rows keep their names: some letters have subscripts, others none
         names = {symbol(f"lambda_{c.name}"): f"λ_{c.name}" for c in system.constraints}
@@ -64,7 +73,12 @@ class Typesetter:
         all_names = (*(c.name for c in system.coordinates), *map(str, (*system.u, *parameters)))
         words = any(tex(name).startswith(r"\mathrm") for name in all_names)
         in_latex = {s: tex(name, n) for s, (name, n) in dotted.items()}
+        in_latex[Symbol("power")] = r"\dot h"  # of Jacobi's integral h
         self._latex = _LatexPrinter(_ambiguous_names(system.definitions) | in_latex, words)
+
+    def internal(self, e: Any) -> Any:
+        """Return an expression over the symbols of the system instead of those of the user."""
+        return sympy.sympify(e).xreplace(self._internal)
 
     def terms(self, e: Expr) -> list[Term]:
         """Return the terms of the sum `e`, sorted for printing, each as a pair (subtracted, term).
@@ -73,7 +87,7 @@ class Typesetter:
         """
         parts = [
             x
-            for part in sympy.Add.make_args(sympy.sympify(e))
+            for part in sympy.Add.make_args(self.internal(e))
             for x in self._split_wide_product(part)
         ]
         return [self.term(part) for part in sorted(parts, key=self._place)]
@@ -105,10 +119,10 @@ class Typesetter:
                 others[others.index(sums[0])] = sympy.Add(*(number * x for x in sums[0].args))
                 number = sympy.S.One
             else:
-                number = sympy.Float(number, 15)
+                number = _shown_number(number)
         ordered = [self.sort_expression(f) for f in sorted(others, key=self._factor)]
         if number != 1 or not ordered:
-            ordered.insert(0, number)
+            ordered.insert(0, _shown_number(number))
         product = ordered[0] if len(ordered) == 1 else sympy.Mul(*ordered, evaluate=False)
         return bool(signed < 0), product
 
@@ -131,7 +145,7 @@ class Typesetter:
             return sympy.ImmutableDenseMatrix(e.applyfunc(self.sort_expression))
         if isinstance(e, sympy.Function) and len(e.args) == 1:
             return e.func(self.sort_expression(e.args[0]), evaluate=False)
-        return sympy.Float(e, 15) if _decimal(e) else e
+        return _shown_number(e)
 
     def _factor(self, f: Expr) -> tuple[Any, ...]:
         base = f.base if f.is_Pow else f
@@ -142,11 +156,18 @@ class Typesetter:
         return (2 if f.is_Pow and not base.is_Function else 6, 0, str(f))
 
     def _place(self, part: Expr) -> tuple[Any, ...]:
-        """Sort key of a term: by accelerations, then velocities, then sign."""
+        """Sort key of a term: accelerations, then products of most velocities, then sign."""
         powers = part.as_powers_dict()
-        degrees = [powers.get(s, 0) for s in self._rates]
-        rank = tuple(-float(n) if n.is_number else 0.0 for n in map(sympy.sympify, degrees))
-        return (*rank, bool(part.as_coeff_Mul()[0] < 0), sympy.default_sort_key(part))
+        degrees = [sympy.sympify(powers.get(s, 0)) for s in self._rates]
+        rank = [-float(n) if n.is_number else 0.0 for n in degrees]
+        n = len(rank) // 2
+        return (
+            *rank[:n],
+            sum(rank[n:]),
+            *rank[n:],
+            bool(part.as_coeff_Mul()[0] < 0),
+            sympy.default_sort_key(part),
+        )
 
     def text(self, e: Expr) -> prettyForm:
         """Return an expression as a block of Unicode text, as SymPy's pretty printer makes it.
@@ -161,6 +182,12 @@ class Typesetter:
                 block = prettyForm("\n".join(line.ljust(longest) for line in lines))
             self._blocks[e] = block
         return self._blocks[e]
+
+    def line(self, e: Expr | MatrixBase) -> str:
+        """Return an expression as one line of text, or the size of a matrix."""
+        if isinstance(e, MatrixBase):
+            return f"a matrix ({e.rows}, {e.cols})"
+        return self._line.doprint(self.sort_expression(self.internal(e)))
 
     def _block(self, e: Expr) -> prettyForm:
         unicode = pretty_use_unicode(True)  # whatever the terminal has: what prints escapes
@@ -195,7 +222,8 @@ class Typesetter:
         """
         lines: list[str] = []
         rows = self.rows(terms, WIDE - 4)
-        ends = [] if right is None else self.rows(right or [(False, sympy.S.Zero)], WIDE - 8)
+        indent = 4 if len(terms) == 1 and terms[0][1].is_Symbol else 8  # of more of the right side
+        ends = [] if right is None else self.rows(right or [(False, sympy.S.Zero)], WIDE - indent)
         for k, row in enumerate(rows):
             block = self._row(row, "" if k == 0 else "+")
             if ends and k == len(rows) - 1:
@@ -208,7 +236,7 @@ class Typesetter:
                     block, ends = closing, ends[1:]
             lines += _indent(block, 4 * (k > 0))
         for row in ends:
-            lines += _indent(self._row(row, "+"), 8)
+            lines += _indent(self._row(row, "+"), indent)
         return lines
 
     def _row(self, row: Sequence[Term], begin: str) -> prettyForm:
@@ -249,18 +277,176 @@ class Typesetter:
         return printed
 
 
-# --- equations with a name on the left, and sections ----------------------------------------------
+# --- equations ------------------------------------------------------------------------------------
 
 
-def named_lines(write: Typesetter, name: str, e: Expr) -> list[str]:
-    """Return the text lines of the equation `name` = `e`."""
-    return write.text_lines([(False, sympy.Symbol(name))], write.terms(e))
+@dataclass(frozen=True, repr=False, eq=False)
+class Equation:
+    """An equation left = right, or the definition of the name on its left.
+
+    `str` returns it as text, and a notebook shows it typeset.
+
+    Attributes
+    ----------
+    title : str
+        What it is, such as "mass matrix". Equations with the same title are printed together.
+    left, right : Expr or Matrix
+        The two sides. A definition has a symbol on the left.
+    write : Typesetter
+        Printer of the two sides.
+    note : str
+        A further line of text, or "".
+    """
+
+    title: str
+    left: Expr
+    right: Expr | MatrixBase
+    write: Typesetter
+    note: str = ""
+
+    @property
+    def is_definition(self) -> bool:
+        """True if the left-hand side is a symbol."""
+        return bool(self.left.is_Symbol)
+
+    def entries(self) -> Iterator[Equation]:
+        """Yield the equation itself, or, of a matrix that is too wide, those of its entries.
+
+        Entries that are zero are left out, and of the mass matrix those below the diagonal.
+        """
+        value = self.right
+        if not isinstance(value, MatrixBase) or self._matrix().width() <= WIDE:
+            yield self
+            return
+        comma = "," if value.rows > 9 else ""
+        for i in range(value.rows):
+            for j in range(i if str(self.left) == "D" else 0, value.cols):
+                if value[i, j] != 0:
+                    place = f"{i + 1}{comma}{j + 1}" if value.cols > 1 else f"{i + 1}"
+                    name = Symbol(f"{self.left}_{place}")
+                    yield replace(self, left=name, right=value[i, j])
+
+    def _matrix(self) -> prettyForm:
+        """Return the matrix on the right as a block of Unicode text."""
+        return self.write.text(self.write.sort_expression(self.write.internal(self.right)))
+
+    def _right(self) -> list[Term]:
+        return [] if self.right == 0 else self.write.terms(self.right)
+
+    def text_lines(self) -> list[str]:
+        """Return the equation as lines of Unicode text of at most WIDE columns."""
+        note = [f"    {self.note}"] if self.note else []
+        if isinstance(self.right, MatrixBase):
+            name, value = self.write.text(self.write.internal(self.left)), self._matrix()
+            block = _join_blocks(name, prettyForm(" = "), value)
+            fits = block.width() <= WIDE
+            return (_indent(block, 0) if fits else [f"{name} =", *_indent(value, 0)]) + note
+        return self.write.text_lines(self.write.terms(self.left), self._right()) + note
+
+    def latex_lines(self) -> list[str]:
+        """Return the equation as lines of an align environment of LaTeX."""
+        write, name = self.write, self.write.latex(self.write.internal(self.left))
+        if isinstance(self.right, MatrixBase):
+            return [f"  {name} &= {write.latex(write.sort_expression(write.internal(self.right)))}"]
+        if self.is_definition:
+            first, *more = write.latex_lines(write.terms(self.right))
+            first = f"  {name} &= {first}"
+        else:
+            first, *more = write.latex_lines(write.terms(self.left), self._right())
+            first = f"  & {first}"
+        return [first, *(CONTINUATION + line for line in more)]
+
+    def __repr__(self) -> str:
+        left, right = map(self.write.line, (self.left, self.right))
+        return f"<Equation {textwrap.shorten(f'{left} = {right}', 60, placeholder=' ...')}>"
+
+    def __str__(self) -> str:
+        return "\n".join(line for entry in self.entries() for line in entry.text_lines())
+
+    def _repr_latex_(self) -> str:
+        return write_latex([[self]])
 
 
-def latex_sum(write: Typesetter, symbol: str, value: Expr) -> list[str]:
-    """Return the LaTeX lines of the equation `symbol` = `value`; `symbol` is LaTeX already."""
-    first, *more = write.latex_lines(write.terms(value))
-    return [f"  {symbol} &= {first}", *(CONTINUATION + line for line in more)]
+class TypesetMatrix(sympy.ImmutableDenseMatrix):  # type: ignore[misc]
+    """A matrix of the equations of motion, which a notebook shows typeset as they are."""
+
+    equation: Equation | None = None  # of a result of a computation, which SymPy typesets
+
+    @classmethod
+    def define(cls, equation: Equation) -> TypesetMatrix:
+        """Return the matrix on the right-hand side of an equation."""
+        matrix: TypesetMatrix = cls(*equation.right.shape, [*equation.right])
+        matrix.equation = equation
+        return matrix
+
+    def _repr_latex_(self) -> str:
+        own = self.equation and write_latex([[self.equation]])
+        return str(own or super()._repr_latex_())
+
+
+def write_text(equations: Iterable[Equation]) -> list[str]:
+    """Return equations as sections of Unicode text, one for each title."""
+    parts = []
+    for title, group in groupby(equations, key=lambda each: each.title):
+        members = [*group]
+        blank = [""] * (not members[-1].is_definition)
+        lines = [line for each in members for line in (*str(each).splitlines(), *blank)]
+        parts.append(section(title, lines[: len(lines) - len(blank)]))
+    return parts
+
+
+def write_latex(groups: Iterable[Sequence[Equation]]) -> str:
+    """Return equations as LaTeX: one align* environment of amsmath, or several, for each group.
+
+    Each environment has about MAX_ENVIRONMENT_LENGTH characters at most.
+    """
+    bodies: list[list[str]] = []
+    for group in groups:
+        bodies.append([])
+        for entry in (entry for each in group for entry in each.entries()):
+            if sum(map(len, bodies[-1])) > MAX_ENVIRONMENT_LENGTH:
+                bodies.append([])
+            bodies[-1] += entry.latex_lines()
+    return align(bodies)
+
+
+def align(bodies: Iterable[Sequence[str]]) -> str:
+    """Return an align* environment of LaTeX for each of several lists of lines."""
+    return "\n".join(
+        r"\begin{align*}" + "\n" + " \\\\\n".join(lines) + "\n" + r"\end{align*}"
+        for lines in bodies
+        if lines
+    )
+
+
+_FUNCTION = re.compile(r"<mi>(a?(?:sin|cos|tan)h?|exp|log|min|max|arg)</mi>")
+_SPACED = r'<mo lspace="0.17em" rspace="0.17em">\1</mo>'
+
+
+def write_mathml(equations: Iterable[Equation]) -> list[tuple[bool, Markup]]:
+    """Return equations as lines of MathML, which browsers show without a script.
+
+    Each line is a pair (continues, MathML), where continues is True if the line continues the
+    equation of the previous line. latex2mathml makes them from LaTeX. Raises EomcError if it is not
+    installed.
+    """
+    return [
+        (line.startswith(CONTINUATION), _convert_to_mathml(line))
+        for each in equations
+        for entry in each.entries()
+        for line in entry.latex_lines()
+    ]
+
+
+@cache
+def _convert_to_mathml(line: str) -> Markup:
+    try:
+        from latex2mathml.converter import convert
+    except ImportError:
+        raise EomcError("equations in a page need latex2mathml: pip install latex2mathml") from None
+    latex = line.removeprefix(CONTINUATION).replace("&", "", 1).strip()
+    converted = convert(latex).replace('display="inline"', 'displaystyle="true"')
+    return Markup(_FUNCTION.sub(_SPACED, converted))
 
 
 def section(head: str, lines: list[str]) -> str:
@@ -316,14 +502,24 @@ def shorten_fractions(value: Expr) -> Expr:
     short = _round_numbers(sympy.expand(value))
     plain = _round_numbers(sympy.expand(short))  # each factor whole again
     return plain.xreplace(
-        {x: _simple_fraction(x) or sympy.Float(x, 15) for x in _long_numbers(plain)}
+        {x: simple_fraction(x) or sympy.Float(x, 15) for x in _long_numbers(plain)}
     )
 
 
-def _simple_fraction(x: sympy.Rational) -> sympy.Rational | None:
+def simple_fraction(x: Expr) -> sympy.Rational | None:
     """Return the fraction with at most three digits that rounds to the float64 of x, or None."""
-    simple = Fraction(int(x.p), int(x.q)).limit_denominator(999)
+    simple = Fraction(float(x)).limit_denominator(999)
     return sympy.Rational(simple) if float(simple) == float(x) else None
+
+
+def _shown_number(e: Expr) -> Expr:
+    """Return a number as it is printed: as a decimal, or as a fraction of few digits.
+
+    A float of many digits is printed as the fraction that rounds to it, if there is one.
+    """
+    if e.is_Float and len(repr(float(e))) > MIN_LONG_DECIMAL:
+        return simple_fraction(e) or e
+    return sympy.Float(e, 15) if _decimal(e) else e
 
 
 def _round_numbers(e: Expr) -> Expr:

@@ -13,10 +13,20 @@ from dataclasses import dataclass, replace
 from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.base.spatial import apply, plus, scaled
-from eomc.robots.inertias import NO_INERTIA, Inertia
-from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, from_axis_angle, times
-from eomc.scene.assembly import WORLD
+from eomc.robots.geometry import (
+    IDENTITY,
+    IDENTITY_TRANSFORM,
+    NO_INERTIA,
+    ORIGIN,
+    Inertia,
+    Matrix,
+    Transform,
+    Vector,
+    from_axis_angle,
+    times,
+)
 from eomc.scene.joints import JOINTS
+from eomc.scene.scene import WORLD
 
 BARE = "no <inertial>"  # note of a link without inertia and shapes
 Range = tuple[float, float]  # minimum and maximum
@@ -24,6 +34,20 @@ Terms = tuple[tuple[float, str], ...]  # a sum of coordinates, each with its fac
 # rad or m: locked values may violate a coupling by this much: typed decimals are rounded
 COUPLING_TOLERANCE = 1e-4
 UNLIMITED: Range = (-math.inf, math.inf)
+
+
+def input_range(force: Range, factor: float) -> Range:
+    """Return the range of an input such that `factor` times the input is in the range `force`."""
+    if not factor:
+        return UNLIMITED
+    low, high = sorted(f / factor for f in force)
+    return low, high
+
+
+def intersection(one: Range, other: Range) -> Range | None:
+    """Return the range common to two ranges; None if it is empty or a single point."""
+    low, high = max(one[0], other[0]), min(one[1], other[1])
+    return (low, high) if low < high else None
 
 
 @dataclass(frozen=True)
@@ -374,20 +398,27 @@ def with_left_out_note(fault: EomcError, left_out: Sequence[str]) -> EomcError:
     return fault
 
 
-def body_pose(body: RobotBody, values: Sequence[float]) -> tuple[Vector, Matrix]:
+def body_pose(body: RobotBody, values: Sequence[float] | None = None) -> Transform:
     """Return the pose of a body in its parent's frame for given positions of its joint.
 
-    The pose is the offset (m) and the rotation matrix. `values` contains the position of each
-    coordinate of the joint (rad or m).
+    `values` contains the position of each coordinate of the joint (rad or m), by default its
+    initial value.
     """
+    values = [m.start for m in body.motions] if values is None else values
     offset, rotation = body.offset, body.rotation
-    joint = JOINTS[body.joint]
-    for kind, axis, value in zip(joint.motions, joint.motion_axes(body.axes), values, strict=True):
-        if kind == "t":
-            offset = plus(offset, apply(rotation, scaled(axis, value)))
-        else:
-            rotation = times(rotation, from_axis_angle(axis, value))
-    return offset, rotation
+    subspaces = JOINTS[body.joint].subspaces(body.axes, pitch=0.0)
+    for (axis, angular, linear), value in zip(subspaces, values, strict=True):
+        offset = plus(offset, apply(rotation, scaled(axis, linear * value)))
+        rotation = times(rotation, from_axis_angle(axis, angular * value))
+    return Transform(offset, rotation)
+
+
+def initial_poses(bodies: Sequence[RobotBody]) -> dict[str, Transform]:
+    """Return the poses in the world of the bodies, and of the world, at the initial state."""
+    poses = {WORLD: IDENTITY_TRANSFORM}
+    for body in bodies:
+        poses[body.name] = poses[body.parent].compose(body_pose(body))
+    return poses
 
 
 def fix_body(body: RobotBody, offset: Vector, rotation: Matrix) -> RobotBody:
@@ -413,7 +444,7 @@ def with_joints_fixed(robot: Robot, frozen: Mapping[str, float] | None = None) -
         motion = body.motions[0] if body.motions else None
         position = _fixed_position(motion, values, free) if motion else None
         if motion and position is not None:
-            note = f"joint {motion.name} stands at {position:g} {motion.unit}"
+            note = f"joint {motion.name} stands at {position:.12g} {motion.unit}"
             body = replace(
                 fix_body(body, *body_pose(body, (position,))), note=join_notes(body.note, note)
             )

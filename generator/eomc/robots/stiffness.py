@@ -8,8 +8,9 @@ in which loops and couplings do not let the robot move are left out.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,15 +18,17 @@ from numpy.typing import NDArray
 from eomc.base import texts
 from eomc.base.spatial import apply, cross, plus, rotated_inertia, scaled, tensor
 from eomc.integrators.tableaux import RK4
-from eomc.robots.robot import Coupling, JointMotion, Robot, RobotBody, RobotLoop, Terms
-from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, from_axis_angle, times
-from eomc.scene.assembly import WORLD
+from eomc.robots.geometry import IDENTITY_TRANSFORM, Transform, Vector, from_axis_angle, times
+from eomc.robots.robot import Coupling, JointMotion, Robot, RobotBody, RobotLoop
+from eomc.runtime import rank
+from eomc.scene import validate_tables
 from eomc.scene.joints import JOINTS
-from eomc.scene.scene import RunSettings
+from eomc.scene.scene import WORLD
+from eomc.scene.schema import RunSettings
 
 Array = NDArray[np.float64]
 
-FRICTION_WIDTH = 0.01  # m/s or rad/s, a scene's default
+FRICTION_WIDTH = float(validate_tables.FRICTION_WIDTH.text)  # m/s or rad/s
 OSCILLATION_LIMIT, DECAY_LIMIT = (x / RunSettings.h for x in RK4.limits)  # rad/s, 1/s, by default
 # 1/s: friction whose velocities decay faster is smoothed over a wider range. Implicit steps to a
 # tolerance of 1e-11, which estimates of errors take, resolve this decay in double precision
@@ -159,11 +162,11 @@ def _elements(robot: Robot, rows: Sequence[str]) -> list[ForceElement]:
         ]
     for t in robot.tendons:
         elements.append(
-            ForceElement(f"tendon {t.name}", _of_sum(t.terms, rows), t.damping, t.stiffness)
+            ForceElement(f"tendon {t.name}", gradient(t.terms, rows), t.damping, t.stiffness)
         )
     for d in robot.drives:
         if d.law:
-            J = d.gear * _of_sum(robot.coordinate_terms(d.coordinate), rows)
+            J = d.gear * gradient(robot.coordinate_terms(d.coordinate), rows)
             elements.append(
                 ForceElement(f"servo {d.name}", J, max(d.law.kv, 0.0), max(d.law.kp, 0.0))
             )
@@ -173,11 +176,14 @@ def _elements(robot: Robot, rows: Sequence[str]) -> list[ForceElement]:
 def _of_motion(motion: JointMotion, rows: Sequence[str]) -> Array:
     """Return the gradient of a joint's position over the coordinates."""
     of = motion.mimics
-    return _of_sum([(of.gear, of.coordinate) if of else (1.0, motion.name)], rows)
+    return gradient([(of.gear, of.coordinate) if of else (1.0, motion.name)], rows)
 
 
-def _of_sum(terms: Terms | Sequence[tuple[float, str]], rows: Sequence[str]) -> Array:
-    """Return the gradient of a sum of coordinates over the coordinates."""
+def gradient(terms: Iterable[tuple[float, str]], rows: Sequence[str]) -> Array:
+    """Return the gradient (n,) of a linear combination of the n coordinates.
+
+    `terms` are pairs (factor, coordinate), and `rows` are the names of the coordinates, in order.
+    """
     J = np.zeros(len(rows))
     for by, q in terms:
         J[rows.index(q)] += by
@@ -193,24 +199,16 @@ class Rigid:
 
     Attributes
     ----------
-    place, turn
-        Origin of the frame in the world (m), and rotation matrix from the body to the world.
+    pose : Transform
+        Pose of the frame in the world.
     columns : tuple
         For each joint motion on the path from the world to the body: the row of its coordinate, the
         angular velocity for a unit rate of the coordinate, and a function that returns the velocity
         of a point of the body at a given place in the world.
     """
 
-    place: Vector
-    turn: Matrix
+    pose: Transform
     columns: tuple[tuple[int, Vector, Callable[[Vector], Vector]], ...] = ()
-
-    def point(self, at: Vector) -> Vector:
-        """Return the position in the world (m) of a point of the body.
-
-        `at` is the position of the point in the body's frame (m).
-        """
-        return plus(self.place, apply(self.turn, at))
 
     def jacobians(self, at: Vector, n: int) -> tuple[Array, Array]:
         """Return the Jacobians (3, n) of a point's velocity and of the body's angular velocity.
@@ -231,32 +229,27 @@ def rigid_bodies(bodies: Sequence[RobotBody], rows: Sequence[str]) -> dict[str, 
     The world is included as a body. `rows` are the names of the coordinates, in the order of the
     columns of Jacobians.
     """
-    rigid = {WORLD: Rigid(ORIGIN, IDENTITY)}
+    rigid = {WORLD: Rigid(IDENTITY_TRANSFORM)}
     for body in bodies:
         parent = rigid[body.parent]
-        place, turn = parent.point(body.offset), times(parent.turn, body.rotation)
+        place, turn = parent.pose.compose(Transform(body.offset, body.rotation))
         columns, joint = [*parent.columns], JOINTS[body.joint]
-        axes = zip(joint.motions, joint.motion_axes(body.axes), body.motions, strict=True)
-        for kind, axis, m in axes:
+        subspaces = joint.subspaces(body.axes, pitch=0.0)
+        for (axis, angular, linear), m in zip(subspaces, body.motions, strict=True):
             gear = m.mimics.gear if m.mimics else 1.0
             row = rows.index(m.mimics.coordinate if m.mimics else m.name)
             rate = scaled(apply(turn, axis), gear)
-            if kind == "r":
-                columns.append((row, rate, _turning(rate, place)))
-                turn = times(turn, from_axis_angle(axis, m.start))
-            else:
-                columns.append((row, ORIGIN, _sliding(rate)))
-                place = plus(place, apply(turn, scaled(axis, m.start)))
-        rigid[body.name] = Rigid(place, turn, tuple(columns))
+            spin, slide = scaled(rate, angular), scaled(rate, linear)
+            columns.append((row, spin, partial(_velocity, spin, slide, place)))
+            place = plus(place, apply(turn, scaled(axis, linear * m.start)))
+            turn = times(turn, from_axis_angle(axis, angular * m.start))
+        rigid[body.name] = Rigid(Transform(place, turn), tuple(columns))
     return rigid
 
 
-def _turning(rate: Vector, about: Vector) -> Callable[[Vector], Vector]:
-    return lambda at: cross(rate, plus(at, scaled(about, -1.0)))
-
-
-def _sliding(velocity: Vector) -> Callable[[Vector], Vector]:
-    return lambda at: velocity
+def _velocity(spin: Vector, slide: Vector, place: Vector, at: Vector) -> Vector:
+    """Return the velocity at a point `at` of a body that moves so at the point `place`."""
+    return plus(slide, cross(spin, plus(at, scaled(place, -1.0))))
 
 
 def mass_matrix(robot: Robot, rows: Sequence[str]) -> Array:
@@ -268,14 +261,14 @@ def mass_matrix(robot: Robot, rows: Sequence[str]) -> Array:
     rigid = rigid_bodies(robot.bodies, rows)
     for body in robot.bodies:
         its = rigid[body.name]
-        moves, turns = its.jacobians(its.point(body.center), len(rows))
-        inertia = np.array(tensor(rotated_inertia(its.turn, body.inertia)))
+        moves, turns = its.jacobians(its.pose.point(body.center), len(rows))
+        inertia = np.array(tensor(rotated_inertia(its.pose.turn, body.inertia)))
         M += body.mass * moves.T @ moves + turns.T @ inertia @ turns
         for m in body.motions:
             J = _of_motion(m, rows)
             M += m.armature * np.outer(J, J)
     for tendon in robot.tendons:
-        J = _of_sum(tendon.terms, rows)
+        J = gradient(tendon.terms, rows)
         M += tendon.armature * np.outer(J, J)
     return M
 
@@ -291,8 +284,7 @@ def allowed_velocities(robot: Robot, rows: Sequence[str]) -> Array:
     rigid = rigid_bodies(robot.bodies, rows)
     A = [coupling_gradient(c, starts, rows)[None] for c in robot.couplings]
     A += [loop_jacobian(loop, rigid, rows) for loop in robot.loops]
-    _, sizes, ways = np.linalg.svd(np.vstack(A))
-    return np.asarray(ways[int(np.sum(sizes > 1e-9 * sizes.max(initial=0.0))) :].T)
+    return rank.null_space(np.vstack(A))
 
 
 def coupling_gradient(c: Coupling, starts: dict[str, float], rows: Sequence[str]) -> Array:
@@ -303,7 +295,7 @@ def coupling_gradient(c: Coupling, starts: dict[str, float], rows: Sequence[str]
     """
     x = sum(by * starts[q] for by, q in c.second) - c.at
     slope = sum(k * a * x ** (k - 1) for k, a in enumerate(c.polynomial) if k)
-    return _of_sum(c.first, rows) - slope * _of_sum(c.second, rows)
+    return gradient(c.first, rows) - slope * gradient(c.second, rows)
 
 
 def loop_jacobian(loop: RobotLoop, rigid: dict[str, Rigid], rows: Sequence[str]) -> Array:
@@ -314,6 +306,6 @@ def loop_jacobian(loop: RobotLoop, rigid: dict[str, Rigid], rows: Sequence[str])
     state, by name. `rows` are the names of the n coordinates, in order.
     """
     ends = zip((rigid[name] for name in loop.bodies), loop.points, strict=True)
-    pairs = [body.jacobians(body.point(at), len(rows)) for body, at in ends]
+    pairs = [body.jacobians(body.pose.point(at), len(rows)) for body, at in ends]
     moves, turns = (one - other for one, other in zip(*pairs, strict=True))
     return np.vstack([moves, turns]) if loop.joint == "weld" else moves

@@ -15,9 +15,19 @@ from pathlib import Path
 
 from eomc.base import texts
 from eomc.base.errors import EomcError, Problem, SceneError
-from eomc.base.spatial import transposed
+from eomc.base.spatial import as_inertia, transposed
 from eomc.robots import xml
-from eomc.robots.inertias import NO_INERTIA, rotated_inertia
+from eomc.robots.geometry import (
+    NO_INERTIA,
+    ORIGIN,
+    Matrix,
+    Vector,
+    from_rpy,
+    rotated_inertia,
+    times,
+    toward,
+    unit,
+)
 from eomc.robots.robot import (
     BARE,
     UNLIMITED,
@@ -31,10 +41,9 @@ from eomc.robots.robot import (
     with_joints_fixed,
     with_left_out_note,
 )
-from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, from_rpy, times, toward, unit
-from eomc.robots.xml import Tag
-from eomc.scene.assembly import WORLD
+from eomc.robots.xml import AttributeReader, ImportReport, Tag
 from eomc.scene.formulas import suggest
+from eomc.scene.scene import WORLD
 from eomc.scene.scope import cycle_text, find_cycles
 
 GRAVITY: Vector = (0.0, 0.0, -9.81)  # URDF has none: z is up in ROS
@@ -109,21 +118,21 @@ class _UrdfReader:
         self.root = root
         self.path = path
         self.shown = shown
-        self.faults: list[Problem] = []
+        self.report = ImportReport()
         self.lines: dict[str, int] = {}  # of links and joints, by key
 
     def robot(self) -> Robot:
         """Return the robot that the file describes. Raises SceneError with all of its faults."""
         links = self._named("link")
-        if not links and not self.faults:
+        if not links and not self.report.faults:
             self.add_fault("", "the robot has no <link>: a URDF has one for each body")
         bodies = {name: self._link(name, element) for name, element in links.items()}
         elements = self._named("joint")
         read = [self._joint(name, e, bodies) for name, e in elements.items()]
         joints = self._with_mimics([j for j in read if j], elements)
         tree = self._tree(bodies, joints)
-        if self.faults:
-            raise with_left_out_note(SceneError(self.faults), self._unread_parts())
+        if self.report.faults:
+            raise with_left_out_note(SceneError(self.report.faults), self._unread_parts())
         name = self.root.get("name") or self.path.stem
         robot = Robot(
             name=name,
@@ -137,7 +146,7 @@ class _UrdfReader:
 
     def add_fault(self, key: str, message: str) -> None:
         """Add an error message on the link or joint `key`, with its line in the file."""
-        self.faults.append(Problem(message, key, self.shown, self.lines.get(key, 0)))
+        self.report.faults.append(Problem(message, key, self.shown, self.lines.get(key, 0)))
 
     def _parts(self, element: Tag, tags: Sequence[str], key: str) -> None:
         """Report child elements that occur more than once."""
@@ -173,19 +182,22 @@ class _UrdfReader:
             note = f"a {shapes[0]} only, {BARE}" if shapes else BARE
             return RobotBody(name, note=note)
         self._parts(inertial, ("origin", "mass", "inertia"), key)
-        mass, tensor = inertial.first("mass"), inertial.first("inertia")
-        if mass is None or tensor is None:
-            lacks = '<mass value="..."/>' if mass is None else '<inertia ixx="..." .../>'
-            self.add_fault(key, f"its <inertial> has no mass or no inertia: add {lacks}")
-            return RobotBody(name)
-        kilograms = self._number(mass, "value", key, required=True)
+        for part, example in (("mass", 'value="..."'), ("inertia", 'ixx="..." ...')):
+            if inertial.first(part) is None:
+                fault = f"its <inertial> has no mass or no inertia: add <{part} {example}/>"
+                self.add_fault(key, fault)
+                return RobotBody(name)
+        mass, tensor = (self._part(inertial, part, key) for part in ("mass", "inertia"))
+        for a, required in ((mass, ("value",)), (tensor, ("ixx", "iyy", "izz"))):
+            for attribute in required:
+                if attribute not in a:
+                    a.fault(f'<{a.tag.kind}> has no {attribute}: add {attribute}="..."')
+        kilograms = mass.number("value")
         if kilograms < 0:
             self.add_fault(key, f"its mass is negative ({kilograms:g} kg): masses are zero or more")
         center, turn = self._origin(inertial, key)
-        moments = [self._number(tensor, ii, key, required=True) for ii in ("ixx", "iyy", "izz")]
-        products = [self._number(tensor, ij, key) for ij in ("ixy", "ixz", "iyz")]
-        a, b, c, d, e, f = (*moments, *products)
-        inertia = rotated_inertia((a, b, c, d, e, f), turn)
+        entries = map(tensor.number, ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
+        inertia = rotated_inertia(as_inertia(entries), turn)
         return RobotBody(name, mass=kilograms, center=center, inertia=inertia)
 
     # --- joints
@@ -201,9 +213,8 @@ class _UrdfReader:
         ends = [self._end(joint, end, key, bodies) for end in ("parent", "child")]
         offset, rotation = self._origin(joint, key)
         axis: Vector = (1.0, 0.0, 0.0)
-        axis_tag = joint.first("axis")
-        if axis_tag is not None and kind not in ("fixed", "floating"):
-            axis = self._vector(axis_tag, "xyz", key, axis)
+        if kind not in ("fixed", "floating"):
+            axis = self._part(joint, "axis", key).vector("xyz") or axis
             try:
                 axis = unit(axis)
             except ValueError:
@@ -238,29 +249,21 @@ class _UrdfReader:
             return free_motions(name)
         if kind not in ("revolute", "continuous", "prismatic", "planar"):
             return ()
-        damping = friction = 0.0
-        dynamics = joint.first("dynamics")
-        if dynamics is not None:
-            damping = self._number(dynamics, "damping", key)
-            friction = self._number(dynamics, "friction", key)
-            for what, value in (("damping", damping), ("friction", friction)):
-                if value < 0:
-                    self.add_fault(
-                        key, f"its {what} is negative ({value:g}): it would drive the joint"
-                    )
+        dynamics, limit = self._part(joint, "dynamics", key), self._part(joint, "limit", key)
+        damping, friction = dynamics.number("damping"), dynamics.number("friction")
+        for what, value in (("damping", damping), ("friction", friction)):
+            if value < 0:
+                self.add_fault(key, f"its {what} is negative ({value:g}): it would drive the joint")
         of = "m" if kind == "prismatic" else "rad"
         if kind == "planar":
             slide = JointMotion(f"x_{name}", "m", damping=damping, friction=friction)
             return slide, replace(slide, name=f"y_{name}"), JointMotion(f"turn_{name}", "rad")
         start, note = 0.0, "turns without end" if kind == "continuous" else ""
-        ends, limit = JointMotion.limits, joint.first("limit")
-        effort = 0.0 if limit is None else self._number(limit, "effort", key)
-        if limit is not None and kind != "continuous":
-            lower, upper = (self._number(limit, end, key) for end in ("lower", "upper"))
-            if lower or upper:
-                note, ends = f"{lower:g} to {upper:g}", (lower, upper)
-                start = min(max(0.0, lower), upper) if lower <= upper else 0.0
-        speed = 0.0 if limit is None else self._number(limit, "velocity", key)
+        ends, effort, speed = UNLIMITED, limit.number("effort"), limit.number("velocity")
+        lower, upper = limit.number("lower"), limit.number("upper")
+        if kind != "continuous" and (lower or upper):
+            note, ends = f"{lower:g} to {upper:g}", (lower, upper)
+            start = min(max(0.0, lower), upper) if lower <= upper else 0.0
         note = join_notes(note, f"at most {speed:g} {of}/s" if speed > 0 else "")
         driven = (-effort, effort) if effort > 0 else UNLIMITED
         return (JointMotion(name, of, start, note, damping, friction, limits=ends, driven=driven),)
@@ -297,11 +300,8 @@ class _UrdfReader:
         elif leader not in elements:
             near = suggest(leader, elements) or ": remove the <mimic>, or add that joint"
             self.add_fault(key, f"it mimics joint '{leader}', which is not in the file{near}")
-        numbers = {"multiplier": 1.0, "offset": 0.0}
-        for name in numbers:
-            if name in mimic_tag.attributes:
-                numbers[name] = self._number(mimic_tag, name, key)
-        return Mimic(leader, *numbers.values())
+        a = AttributeReader(mimic_tag.attributes, mimic_tag, self.report, key)
+        return Mimic(leader, a.number("multiplier", 1.0), a.number("offset"))
 
     def _as_mimic(self, joint: _Joint, mimic: Mimic, leader: _Joint | None) -> _Joint:
         """Return the joint with its motion as a mimic of the leader's, and without a drive."""
@@ -336,7 +336,7 @@ class _UrdfReader:
                 parent_joints[joint.child] = joint
                 child_joints[joint.parent].append(joint)
         roots = [name for name in bodies if name not in parent_joints]
-        if self.faults:
+        if self.report.faults:
             return []  # a joint at fault leaves its links alone, and they would seem roots
         if len(roots) > 1:
             ends = {e.kind for e in self.root.children if e.kind.lower().endswith("joint")}
@@ -356,7 +356,7 @@ class _UrdfReader:
         loop = next(
             find_cycles({name: [joint.parent] for name, joint in parent_joints.items()}), []
         )
-        if loop and not self.faults:
+        if loop and not self.report.faults:
             self.add_fault(
                 f"joint {parent_joints[loop[0]].name}",
                 f"the links hold one another in a loop ({' on '.join(loop)}): "
@@ -429,45 +429,17 @@ class _UrdfReader:
 
     # --- numbers
 
+    def _part(self, element: Tag, kind: str, key: str) -> AttributeReader:
+        """Return the attributes of a child of the element; none if there is no such child.
+
+        `key` names the link or joint in messages.
+        """
+        tag = element.first(kind)
+        return AttributeReader(tag.attributes if tag else {}, tag or element, self.report, key)
+
     def _origin(self, element: Tag, key: str) -> tuple[Vector, Matrix]:
-        origin = element.first("origin")
-        if origin is None:
-            return ORIGIN, IDENTITY
-        offset = self._vector(origin, "xyz", key, ORIGIN)
-        return offset, from_rpy(*self._vector(origin, "rpy", key, ORIGIN))
-
-    def _vector(self, element: Tag, attribute: str, key: str, default: Vector) -> Vector:
-        written = element.attributes.get(attribute)
-        if written is None:
-            return default
-        words = written.split()
-        if len(words) != 3:
-            what = f'{attribute}="{written}" of <{element.kind}> is not three numbers'
-            self.add_fault(key, what + _macro(written))
-            return default
-        x, y, z = (self._value(word, f"{attribute} of <{element.kind}>", key) for word in words)
-        return x, y, z
-
-    def _number(self, element: Tag, attribute: str, key: str, required: bool = False) -> float:
-        written = element.attributes.get(attribute)
-        if written is None:
-            if required:
-                self.add_fault(key, f'<{element.kind}> has no {attribute}: add {attribute}="..."')
-            return 0.0
-        return self._value(written, f"{attribute} of <{element.kind}>", key)
-
-    def _value(self, word: str, what: str, key: str) -> float:
-        """Return the number; record a fault and return 0 if it is none, so that reading goes on."""
-        try:
-            return xml.number(word)
-        except ValueError as why:
-            self.add_fault(key, f"{what}: {why}{_macro(word)}")
-            return 0.0
-
-
-def _macro(written: str) -> str:
-    """Return the remedy if a number contains a xacro macro, or ""."""
-    return "; " + xml.RUN_XACRO if "${" in written or "$(" in written else ""
+        origin = self._part(element, "origin", key)
+        return origin.vector("xyz") or ORIGIN, from_rpy(*(origin.vector("rpy") or ORIGIN))
 
 
 def _mimic_description(motion: JointMotion) -> str:

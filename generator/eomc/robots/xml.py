@@ -1,4 +1,4 @@
-"""Untrusted XML: its reader, and the elements and attributes that a format of robot files has.
+"""Untrusted XML: its reader, values of attributes, and the elements that a robot format has.
 
 The reader expands no entities and opens no other file.
 
@@ -19,14 +19,15 @@ import math
 import os
 import re
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import ParseError
 
 from eomc.base import texts
-from eomc.base.errors import EomcError
+from eomc.base.errors import EomcError, Problem
+from eomc.robots.geometry import Vector
 from eomc.scene.formulas import suggest
 
 MAX_BYTES = 20_000_000  # the largest robot files without their meshes have one or two million
@@ -195,6 +196,169 @@ def _bytes(path: Path, shown: str) -> bytes:
     except (OSError, ValueError) as fault:
         why = getattr(fault, "strerror", None) or fault
         raise EomcError(f"{shown}: can't be read ({why})") from None
+
+
+# --- values of attributes, and the report ---------------------------------------------------------
+
+SHOWN = 12  # names in one note on parts that are left out
+BOOLEAN = ("false", "true")
+
+Attributes = dict[str, str]
+
+
+@dataclass
+class ImportReport:
+    """Errors and notes from reading a robot file.
+
+    Attributes
+    ----------
+    faults : list of Problem
+        Errors, all of which are reported together.
+    strangers : tuple of str
+        Notes on elements and attributes that the format does not define.
+    left : dict
+        Names of the parts that are not modelled, by kind.
+    """
+
+    faults: list[Problem] = field(default_factory=list)
+    strangers: tuple[str, ...] = ()
+    left: dict[str, list[str]] = field(default_factory=dict)
+
+    def leave_out(self, kind: str, name: str = "") -> None:
+        """Record that a part of the file is left out of the model.
+
+        `kind` describes the kind of part, and `name` is its name, or "" without one.
+        """
+        self.left.setdefault(kind, []).append(name)
+
+    def mark_read(self, kind: str, name: str) -> None:
+        """Remove the record that the part `name` of the given kind is left out of the model."""
+        those = self.left.get(kind, [])
+        if name in those:
+            those.remove(name)
+            if not those:
+                del self.left[kind]
+
+    def notes(self) -> tuple[str, ...]:
+        """Return the notes on what is left out: one for each kind of part, with number and names.
+
+        A name that was recorded twice counts once. Notes on unknown elements come first.
+        """
+        lines = [*self.strangers]
+        for kind, those in self.left.items():
+            names = [*dict.fromkeys(name for name in those if name)]
+            count = those.count("") + len(names)
+            line = f"{kind} ({count})" if count > 1 else kind
+            if named := names[:SHOWN]:
+                more = count - len(named)
+                line += f": {', '.join(named)}" + (f" and {more} more" if more else "")
+            lines.append(line)
+        return tuple(lines)
+
+
+@dataclass(frozen=True)
+class AttributeReader:
+    """Access to the attributes of an element (`tag`) as numbers, words or vectors.
+
+    Attributes may be the element's own or inherited. Faults in them are added to `report`. `label`
+    names the element of which `tag` is a part; by default, messages name `tag`.
+    """
+
+    attributes: Attributes
+    tag: Tag
+    report: ImportReport
+    label: str = ""
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.attributes
+
+    def get(self, key: str, default: str = "") -> str:
+        """Return the text of an attribute, or `default` if it is missing."""
+        return self.attributes.get(key, default)
+
+    def fault(self, message: str) -> None:
+        """Add an error message, with the line of the element, to the report.
+
+        Reading continues, so that all faults are reported together.
+        """
+        tag, label = self.tag, self.label or _element_label(self.tag)
+        self.report.faults.append(Problem(message, label, str(tag.file), tag.line))
+
+    def numbers(self, key: str, most: int, least: int | None = None) -> tuple[float, ...] | None:
+        """Return the numbers in an attribute; None if it is missing or faulty.
+
+        There must be at most `most` and at least `least` numbers (default: `most`).
+        """
+        text = self.attributes.get(key)
+        if text is None:
+            return None
+        least = most if least is None else least
+        what = f'{key}="{text}"' + (f" of <{self.tag.kind}>" if self.label else "")
+        macro = f"; {RUN_XACRO}" if "${" in text or "$(" in text else ""
+        try:
+            values = tuple(map(number, text.split()))
+        except ValueError as why:
+            self.fault(f"{what}: {why}{macro}")
+            return None
+        if not least <= len(values) <= most:
+            expected = str(most) if least == most else f"{least} to {most}"
+            self.fault(f"{what} has {len(values)} numbers; it takes {expected}{macro}")
+            return None
+        return values
+
+    def vector(self, key: str) -> Vector | None:
+        """Return the three numbers of an attribute; None if it is missing or faulty."""
+        values = self.numbers(key, 3)
+        return (values[0], values[1], values[2]) if values else None
+
+    def number(self, key: str, default: float = 0.0) -> float:
+        """Return the number in an attribute, or `default` if it is missing or faulty."""
+        values = self.numbers(key, 1)
+        return values[0] if values else default
+
+    def linear_coefficient(self, key: str, kinds: str, name: str) -> float:
+        """Return the first of up to three coefficients of a polynomial; report the others.
+
+        `kinds` is the kind of element in the plural, and `name` that of the element.
+        """
+        first, *others = self.numbers(key, 3, 1) or (0.0,)
+        if any(others):
+            self.report.leave_out(f"{key} in the square and cube of {kinds}", name)
+        return first
+
+    def choice(self, key: str, choices: Sequence[str], default: str = "") -> str:
+        """Return the word in an attribute, which must be one of `choices`.
+
+        It is `default` if the attribute is missing or faulty; the first choice by default.
+        """
+        default = default or choices[0]
+        word = self.get(key, default)
+        if word in choices:
+            return word
+        self.fault(f'{key}="{word}" is not one of {", ".join(choices)}')
+        return default
+
+    def reference(self, key: str, kind: str, known: Collection[str]) -> str:
+        """Return the name in an attribute, which must be one of `known`; "" after a fault.
+
+        `kind` is the kind of element that has this name.
+        """
+        name = self.get(key)
+        if name in known:
+            return name
+        missing = f'there is no {kind} "{name}"{suggest(name, known)}'
+        self.fault(missing if name else f"it needs {key}")
+        return ""
+
+    def is_true(self, key: str, default: bool = False) -> bool:
+        """Return True if the attribute is "true"; `default` if it is missing or faulty."""
+        return self.choice(key, BOOLEAN, BOOLEAN[default]) == "true"
+
+
+def _element_label(tag: Tag) -> str:
+    """Return the label of an element in error messages: its kind and its name."""
+    name = tag.get("name")
+    return f'{tag.kind} "{name}"' if name else tag.kind
 
 
 # --- formats of robot files -----------------------------------------------------------------------

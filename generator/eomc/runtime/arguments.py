@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 import os
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cache
 from math import isfinite
 from typing import Any, NoReturn
 
@@ -17,15 +18,13 @@ import numpy as np
 from numpy import empty, ndarray
 from numpy.typing import ArrayLike, NDArray
 
-from .c_library import CLibrary
-from .info import SceneInfo
+from .info import CLibrary, SceneInfo
 from .package import initial_value_message, reduced, suggestion
 
 Array = NDArray[Any]
 Start = ArrayLike | Mapping[str, ArrayLike] | None  # positions or velocities, also by name
 Parameters = Mapping[str, float] | Sequence[float] | Array | None
 
-MIN_RESOLVED_TIMES = 256  # floating-point times within an adaptive run
 _MAX_LIST_NUMBERS = 32  # below this size Python checks numbers faster than NumPy
 
 
@@ -45,17 +44,7 @@ class Params:
     def __init__(self, /, **values: float) -> None:
         object.__setattr__(self, "_array", np.array(self._defaults, self._dtype))
         for name, value in values.items():
-            self._set(name, value)
-
-    def _set(self, name: str, value: float) -> None:
-        if name not in self._names:
-            raise ValueError(not_one_of("params", name, self._names))
-        if not isinstance(value, str) and np.ndim(value) == 1:
-            raise ValueError(
-                f"params: {name}: {value!r} is not a number: one each is for many states, as in "
-                "simulate_batch"
-            )
-        self._array[self._names.index(name)] = as_number(value, f"params: {name}")
+            setattr(self, name, value)
 
     def __getattr__(self, name: str) -> float:
         if name not in self._names:
@@ -63,7 +52,7 @@ class Params:
         return float(self._array[self._names.index(name)])
 
     def __setattr__(self, name: str, value: float) -> None:
-        self._set(name, value)
+        set_parameter(self._array, self._names, name, value)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)
@@ -90,6 +79,20 @@ class Params:
         return in_a_line("Params(", [f"{n}={v:g}" for n, v in both], ")")
 
 
+def set_parameter(values: Array, names: tuple[str, ...], name: str, value: Any) -> None:
+    """Set the value of a parameter in an array of all values.
+
+    Raises ValueError for an unknown name, or a value that is not a finite number.
+    """
+    place = index_of("params", name, names)
+    if not isinstance(value, str) and np.ndim(value) == 1:
+        raise ValueError(
+            f"params: {name}: {value!r} is not a number: one each is for many states, as in "
+            "simulate_batch"
+        )
+    values[place] = as_number(value, f"params: {name}")
+
+
 class Arguments:
     """Conversion of the arguments of a compiled scene to arrays and pointers for C.
 
@@ -97,6 +100,8 @@ class Arguments:
 
     Attributes
     ----------
+    places : dict
+        Index of each parameter, by name.
     default_pointers : tuple
         Pointers to the positions, velocities and parameters of the scene.
     Params : type
@@ -107,6 +112,7 @@ class Arguments:
         self.info, self.c, self.dtype, self.nq = info, c, info.dtype, info.nq
         # shape of a state that is small enough for lists of numbers
         self.small_shape = (info.nq,) if info.nq <= _MAX_LIST_NUMBERS else None
+        self.places = {name: k for k, name in enumerate(info.parameters)}
         self.default_pointers = tuple(c.pointer(x) for x in (*info.initial_state, info.p0))
         names = {
             "_names": info.parameters,
@@ -149,22 +155,17 @@ class Arguments:
 
     def numbers(self, value: ArrayLike, name: str) -> Array:
         """Return a C-contiguous, aligned array of the module's precision, of any shape."""
-        if not isinstance(value, list):
-            without_mask(value, name)
-        try:
-            array = np.asarray(value)
-            if array.dtype.kind in "cUSmM":  # text that looks like a number is none
-                raise TypeError
-            return aligned(np.ascontiguousarray(array, self.dtype))
-        except (TypeError, ValueError, OverflowError):
-            order = f": give them in order, {', '.join(self.info.coordinates)}"
-            remedy = order if isinstance(value, Mapping) else ""
-            parts = value if isinstance(value, (list, tuple)) else [value]
-            if callable(value) and name == "u":
-                remedy = ": give what it returns, u(t, q, qd); runs alone call functions"
-            elif name[0] == "u" and any(map(callable, parts)):
-                remedy = ": one function u(t, q, qd) gives all inputs, in order or as a dict"
-            raise ValueError(f"{name}: {value!r} is not an array of numbers{remedy}") from None
+        return aligned(np.ascontiguousarray(as_numbers(value, name, self.dtype, self._remedy)))
+
+    def _remedy(self, value: Any, name: str) -> str:
+        """Return a remedy for a value that is not an array of numbers, as the end of a message."""
+        parts = value if isinstance(value, (list, tuple)) else [value]
+        if callable(value) and name == "u":
+            return ": give what it returns, u(t, q, qd); runs alone call functions"
+        if name[0] == "u" and any(map(callable, parts)):
+            return ": one function u(t, q, qd) gives all inputs, in order or as a dict"
+        order = f": give them in order, {', '.join(self.info.coordinates)}"
+        return order if isinstance(value, Mapping) else ""
 
     def array(self, value: ArrayLike, name: str, width: int, many: bool = True) -> Array:
         """Return an array of finite numbers, (width,), or also (n, width) if `many`."""
@@ -172,12 +173,6 @@ class Arguments:
             array = value  # C-contiguous, aligned and, which need not be, writeable
         else:
             array = self.numbers(value, name)
-        if (
-            array.ndim == 1
-            and array.size == width <= _MAX_LIST_NUMBERS
-            and isfinite(sum(array.tolist()))
-        ):
-            return array  # of few numbers the sum is quickest; it may overflow all the same
         if array.shape[-1:] != (width,) or array.ndim > 1 + many:
             description = f"shape {np.shape(value)}" if np.ndim(value) else repr(value)
             rates = array.shape == (2 * self.nq,) and name in ("q", "q0")
@@ -187,7 +182,7 @@ class Arguments:
                 f"{'; velocities go to qd' + name[1:] if rates else ''}"
             )
         if array.size <= _MAX_LIST_NUMBERS and isfinite(sum(array.ravel().tolist())):
-            return array
+            return array  # of few numbers the sum is quickest; it may overflow all the same
         if not np.isfinite(array).all():
             if array.ndim == 1:
                 raise ValueError(f"{name}: {np.array2string(array, threshold=20)} is not finite")
@@ -202,39 +197,42 @@ class Arguments:
             raise ValueError(f"qd: shape {moving.shape} with q of shape {at.shape}")
         return at, moving
 
-    def initial_half(self, x0: Any, name: str) -> tuple[Array, Any]:
-        """Return q0 or qd0, (nq,), as an array and what C reads it from."""
-        if (numbers := self.as_list(x0, self.small_shape)) is not None:
-            return x0, numbers  # _listed accepts arrays only
+    def initial_half(self, x0: Any, name: str) -> Array:
+        """Return q0 or qd0 as an array (nq,), which may be the caller's."""
+        if self.as_list(x0, self.small_shape) is not None:
+            array: Array = x0
+            return array
         x = self.numbers(x0, name)
         if x.ndim == 2 and x.shape[1] == self.nq:
             raise ValueError(
                 f"{name}: shape {x.shape}, expected one state, ({self.nq},): "
                 f"{', '.join(self.info.coordinates)}; simulate_batch takes many"
             )
-        x = self.array(x0, name, self.nq, many=False)
-        return x, self.c.pointer(x)
-
-    def one_state(self, q: ArrayLike, qd: ArrayLike) -> tuple[Array, Array]:
-        """Return positions and velocities of one state as arrays (nq,)."""
-        return self.state(q, qd, many=False)
+        return self.array(x0, name, self.nq, many=False)
 
     def parameters(self, params: Any) -> Array:
         """Return all parameters as an array (np,): the given values, else those of the scene."""
         if params is None:
             return self.info.p0
-        if isinstance(params, self.Params):
-            values: Array = params._array
-            return values
-        if hasattr(params, "_names"):  # Params of another module
-            raise ValueError(f"params: these are another scene's: {', '.join(params._names)}")
-        if isinstance(params, Mapping):
-            complete = self.Params()
-            for name, value in by_name(params).items():
-                if name in self.info.coordinates:
+        values: Array
+        if type(params) is not dict:
+            if isinstance(params, self.Params):
+                values = params._array
+                return values
+            if hasattr(params, "_names"):  # Params of another module
+                raise ValueError(f"params: these are another scene's: {', '.join(params._names)}")
+        if type(params) is dict or isinstance(params, Mapping):
+            values = self.info.p0.copy()
+            for key, value in params.items():
+                name = key if type(key) is str else name_of(key)
+                k = self.places.get(name)
+                if k is not None and type(value) is float and isfinite(value):
+                    values[k] = value
+                elif name in self.info.coordinates:
                     raise ValueError(f"params: {initial_value_message(self, name)}")
-                setattr(complete, name, value)
-            return np.asarray(complete._array)
+                else:
+                    set_parameter(values, self.info.parameters, name, value)
+            return values
         without_mask(params, "params")
         try:
             array = self.numbers(params, "params")
@@ -293,9 +291,7 @@ class Arguments:
         which are evaluated within it.
         """
         u = by_name(u)
-        for name in u:
-            if name not in self.info.inputs:
-                raise ValueError(not_one_of("u", name, self.info.inputs))
+        as_names("u", u, self.info.inputs)
         if missing := [name for name in self.info.inputs if name not in u]:
             raise ValueError(
                 f"u: no value for {', '.join(missing)}: give all inputs, or None for the signals "
@@ -311,12 +307,9 @@ class Arguments:
         try:
             return np.stack(np.broadcast_arrays(*lined), axis=-1)
         except ValueError:
-            raise ValueError(
-                "u: "
-                + ", ".join(
-                    f"{n} has shape {s}" for n, s in zip(self.info.inputs, shapes, strict=True)
-                )
-            ) from None
+            both = zip(self.info.inputs, shapes, strict=True)
+            shown = ", ".join(f"{name} has shape {shape}" for name, shape in both)
+            raise ValueError(f"u: {shown}") from None
 
     def for_each_state(
         self, x: ArrayLike, name: str, shape: tuple[int, ...], q: ArrayLike
@@ -368,9 +361,22 @@ class Arguments:
             return empty(shape, self.dtype), empty(shape, self.dtype)
         if not isinstance(out, (tuple, list)) or len(out) != 2:
             raise ValueError("out: expected a pair of arrays, (q, qd)")
-        return self.output_array(out[0], shape, "out[0]"), self.output_array(
-            out[1], shape, "out[1]"
-        )
+        q, qd = (self.output_array(x, shape, f"out[{k}]") for k, x in enumerate(out))
+        return q, qd
+
+    def output_matrices(self, out: Any, names: str, q: Array, qd: Array) -> tuple[Array, Array]:
+        """Return arrays (2 nq, 2 nq) and (2 nq, nu) of each state: those of `out`, or new ones."""
+        shape = (*q.shape[:-1], 2 * self.nq)
+        if not (out is None or (isinstance(out, (tuple, list)) and len(out) == 2)):
+            raise ValueError(f"out: expected a pair of arrays, {names}")
+        first, second = (None, None) if out is None else out
+        A = self.output_array(first, (*shape, 2 * self.nq), "out[0]")
+        B = self.output_array(second, (*shape, self.info.nu), "out[1]")
+        if out is not None and any(
+            np.may_share_memory(*pair) for pair in ((A, B), (A, q), (A, qd), (B, q), (B, qd))
+        ):
+            raise ValueError("out: its arrays overlap each other or the state")
+        return A, B
 
 
 class StateArguments:
@@ -452,11 +458,8 @@ class StateArguments:
             return self.t, self.u, self.p, self.own
         if self.times is not None:
             self.own.t = self._from_t + k
-        u, p = (
-            x + stride * k if stride else x
-            for x, stride in ((self.u, self.own.u), (self.p, self.own.p))
-        )
-        return self.t, u, p, self.own
+        u = self.u + self.own.u * k if self.own.u else self.u
+        return self.t, u, self.p + self.own.p * k, self.own
 
 
 def row_times(arguments: Arguments, t: Any, rows: tuple[int, ...]) -> Array | None:
@@ -488,12 +491,37 @@ def _finite(array: Array, words: str) -> Array:
     return array
 
 
+def as_numbers(
+    value: Any, name: str, dtype: np.dtype[Any], remedy: Callable[[Any, str], str] | None = None
+) -> Array:
+    """Convert a value of any shape to a C-contiguous array of type `dtype`.
+
+    Raises ValueError, which begins with the argument's `name` and ends with remedy(value, name), if
+    the value is not numeric.
+    """
+    if not isinstance(value, list):
+        without_mask(value, name)
+    try:
+        array = np.asarray(value)
+        if array.dtype.kind in "cUSmM":  # text that looks like a number is none
+            raise TypeError
+        return np.asarray(array, dtype, order="C")
+    except (TypeError, ValueError, OverflowError):
+        end = remedy(value, name) if remedy else ""
+        raise ValueError(f"{name}: {value!r} is not an array of numbers{end}") from None
+
+
 def by_name(values: Mapping[Any, Any]) -> dict[str, Any]:
     """Return a dict with the same values whose keys are strings.
 
     A key may also be a SymPy symbol or a SymPy function of time, whose name becomes the key.
     """
-    return {k if type(k) is str else str(getattr(k, "name", k)): x for k, x in values.items()}
+    return {k if type(k) is str else name_of(k): x for k, x in values.items()}
+
+
+def name_of(key: Any) -> str:
+    """Return the name of a SymPy symbol or function, or any other key as text."""
+    return str(getattr(key, "name", key))
 
 
 def without_mask(value: Any, name: str) -> Any:
@@ -590,6 +618,7 @@ def check_time(dtype: np.dtype[Any], t0: float, span: float, h: float | None = N
     module. t0: start of the run, s. span: duration of the run, s. h: size of fixed steps, s; None:
     adaptive steps.
     """
+    min_times = 256  # floating-point times within an adaptive run
     least = math.ulp(abs(t0) + abs(span))
     if dtype.itemsize == 4:
         with np.errstate(over="ignore", invalid="ignore"):
@@ -600,7 +629,7 @@ def check_time(dtype: np.dtype[Any], t0: float, span: float, h: float | None = N
             f"h: {h:g} s is less than what time resolves at {t0 + span:g} s, {least:.2g} s: take "
             "a smaller t0, or a larger h"
         )
-    if span and h is None and not abs(span) >= MIN_RESOLVED_TIMES * least:
+    if span and h is None and not abs(span) >= min_times * least:
         raise ValueError(
             f"t0: time resolves {least:.2g} s at {t0 + span:g} s, which is too coarse for steps "
             f"within {span:g} s: take a smaller t0, or a longer duration"
@@ -653,6 +682,7 @@ def as_count(value: Any, name: str, least: int) -> int:
     return int(number)
 
 
+@cache
 def machine_memory() -> float:
     """Return the physical memory of the machine in bytes; inf if it is unknown.
 
@@ -675,6 +705,28 @@ def not_one_of(argument: str, name: str, known: Sequence[str]) -> str:
     if not known:
         return f"{argument}: there is no '{name}': this scene has none"
     return f"{argument}: '{name}' is not one of {', '.join(known)}{suggestion(name, known)}"
+
+
+def index_of(argument: str, name: Any, known: Sequence[str]) -> int:
+    """Return the index of a name in a sequence; raise ValueError, as `not_one_of`, without it."""
+    if name not in known:
+        raise ValueError(not_one_of(argument, str(name), known))
+    return known.index(name)
+
+
+def as_names(argument: str, names: Any, known: Sequence[str]) -> tuple[str, ...]:
+    """Return names as a tuple; a str is one name. Raises ValueError for names that are not known.
+
+    argument: name of the function's argument, for the message.
+    """
+    if isinstance(names, str):
+        names = (names,)
+    if not isinstance(names, Iterable):
+        raise ValueError(f"{argument}: {names!r} is no list of names: {', '.join(known)}")
+    result: tuple[str, ...] = tuple(names)
+    for name in result:
+        index_of(argument, name, known)
+    return result
 
 
 def in_a_line(start: str, parts: Sequence[str], end: str, width: int = 80) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import ceil
 from typing import Any
@@ -11,15 +11,13 @@ from typing import Any
 import numpy as np
 
 from .arguments import Array
+from .columns import ROWS_PER_STEP
 from .interfaces import CompiledModel
 from .package import reduced
-from .trajectory_data import Trajectory
+from .saved import NOT_STORED
 
 _MAX_ORDER = 8  # of the interpolating polynomials, and so of the quadrature
 _MIN_ROWS = 2 * _MAX_ORDER + 1  # fewer rows give no error estimate
-_MIN_ORDER = 0.5  # observed order of the quadrature is at least this
-_MAX_RELATIVE_ERROR = 0.005  # of the quadrature, for a balance that is reported
-_ROWS_PER_STEP = 8  # between jumps
 _MIN_PIECE_ROWS = 4 * _MAX_ORDER + 1  # rows of a piece between jumps
 _MAX_ROWS = 400_000  # rows of all pieces
 
@@ -103,7 +101,7 @@ class _PowerSamples:
         return np.asarray(values, float)
 
 
-def balance(run: Trajectory) -> Balance | None:
+def balance(run: Any) -> Balance | None:
     """Return the energy balance of a run, or None if it cannot be computed.
 
     The balance cannot be computed if an energy or a force is not finite at a row, or if the inputs
@@ -118,14 +116,11 @@ def balance(run: Trajectory) -> Balance | None:
     model, energy = run.model, rows.values(run.model.functions.jacobi)
     none = np.zeros(model.info.nu) if model.info.nu else None
     power, rest = (rows.values(model.functions.power, u=u) for u in (rows.u, none))
-    reverse = _velocity_reversal(model)
-    forward, backward = (
-        rows.values(
-            lambda q, qd, transform=transform, **how: model.functions.tau(*transform(q, qd), **how),
-            u=none,
-        )
-        for transform in (lambda q, qd: (q, qd), reverse)
-    )
+    # the modes of Coulomb friction are signs of velocities and change their sign as well
+    signs = np.ones(model.info.nq, model.info.dtype)
+    signs[[at for at, _ in model.info.constraints.modes]] = -1
+    reversed_rows = replace(rows, q=signs * rows.q, qd=-rows.qd)
+    forward, backward = (x.values(model.functions.tau, u=none) for x in (rows, reversed_rows))
     if not all(np.isfinite(x).all() for x in (power, rest, forward, backward)):
         return None
     braking = np.sum((backward - forward) / 2 * rows.qd, axis=1).astype(float)
@@ -140,34 +135,26 @@ def balance(run: Trajectory) -> Balance | None:
     off, rounding = max(off, blur), float(np.finfo(model.info.dtype).eps * np.max(np.abs(energy)))
     left = float(np.max(np.abs(energy - energy[0] - work - jump_work)))
     jumped = float(jump_work[-1])
-    is_resolved = off <= max(_MAX_RELATIVE_ERROR * max(map(abs, (*parts, jumped))), 10 * rounding)
+    max_relative_error = 0.005  # of the quadrature, for a balance that is reported
+    is_resolved = off <= max(max_relative_error * max(map(abs, (*parts, jumped))), 10 * rounding)
     return Balance(*parts, left, off + rounding, is_resolved=is_resolved, jumps=jumped)
 
 
-def _velocity_reversal(model: CompiledModel) -> Callable[[Array, Array], tuple[Array, Array]]:
-    """Return the function that reverses the velocities of a state.
-
-    The modes of Coulomb friction are signs of velocities and change their sign as well.
-    """
-    signs = np.ones(model.info.nq, model.info.dtype)
-    signs[[at for at, _ in model.info.constraints.modes]] = -1
-    return lambda q, qd: (signs * q, -qd)
-
-
-def _rows(run: Trajectory) -> _PowerSamples | None:
+def _rows(run: Any) -> _PowerSamples | None:
     """Return samples whose power is smooth between jumps of the state or the inputs."""
-    model, u = run.model, run.input_source
+    model, u = run.model, run.request.u
     if u is None or np.ndim(u) == 1:
         # all rows: a few of them may look smooth although the power is not
         states = _in_steps(run) or _between_jumps(run)
-        return _PowerSamples(model, run.parameter_values, *states, u)
-    run = with_jumps(run)
+        return _PowerSamples(model, run.request.p, *states, u)
+    run = run.with_jump_rows()
     ends, values = _piecewise_inputs(run)
     if not len(values):
         return None
     after_jumps = 1 + np.flatnonzero(np.diff(run.t) == 0)  # rows after jumps
     periods, (ends, values) = ends, _cut(ends, values, run.t[after_jumps])
-    each = (_ROWS_PER_STEP if hasattr(run, "tol") else 1) * ceil(run.steps / (len(periods) - 1)) + 1
+    per_step = 1 if run.request.has_equal_steps else ROWS_PER_STEP
+    each = per_step * ceil(run.steps / (len(periods) - 1)) + 1
     count = min(max(each, _MIN_ROWS), max(_MAX_ROWS // len(values), 2))
     t = np.concatenate([np.linspace(a, b, count) for a, b in pairwise(ends.tolist())])
     q, qd = run(t)
@@ -177,7 +164,7 @@ def _rows(run: Trajectory) -> _PowerSamples | None:
             t, q, qd = np.append(t, t[-1:]), np.append(q, q[-1:], 0), np.append(qd, qd[-1:], 0)
         q[first], qd[first] = run.q[row], run.qd[row]
     piece = np.minimum(np.arange(len(t)) // count, len(values) - 1)
-    return _PowerSamples(model, run.parameter_values, t, q, qd, values[piece])
+    return _PowerSamples(model, run.request.p, t, q, qd, values[piece])
 
 
 def _cut(ends: Array, values: Array, at: Array) -> tuple[Array, Array]:
@@ -194,20 +181,11 @@ def _piecewise_inputs(run: Any) -> tuple[Array, Array]:
 
     n = 0 if the inputs are unknown.
     """
-    unknown, last = (np.zeros(1), np.zeros((0, run.model.info.nu))), float(run.t[-1])
-    if hasattr(run, "tol"):
-        values = run._period_inputs
-        if values is None:
-            return unknown
-        starts = run.t0 + run._period * np.arange(len(values))
-    elif (values := getattr(run, "law_values", None)) is not None:
-        starts = run.t0 + run.h * run.hold * np.arange(len(values))
-    else:
-        values = run.input_source if np.ndim(run.input_source) == 2 else run.applied_inputs
-        if values is None or (np.ndim(run.input_source) != 2 and run.every > 1):
-            return unknown
-        first = np.arange(0, min(run.steps, len(values)), run.hold)
-        starts, values = run.t0 + run.h * first, values[first]
+    request, last = run.request, float(run.t[-1])
+    values = request.u if run.period_inputs is None else run.period_inputs
+    if np.ndim(values) != 2 or (isinstance(request.u, str) and request.u == NOT_STORED):
+        return np.zeros(1), np.zeros((0, run.model.info.nu))
+    starts = request.t0 + (request.period or request.h) * np.arange(len(values))
     started = starts < last
     return np.append(starts[started], last), values[started]
 
@@ -219,14 +197,14 @@ def _in_steps(run: Any) -> tuple[Array, Array, Array] | None:
     the time have no inner rows. None for fixed steps, or if there are too many steps.
     """
     if (
-        not hasattr(run, "tol")
+        run.request.has_equal_steps
         or run.steps * _MIN_ROWS > _MAX_ROWS
         or not run.model.functions.has_power
     ):
         return None
-    run = with_jumps(run)
+    run = run.with_jump_rows()
     if np.sum(np.diff(run.t) > 0) != run.steps:  # its rows are at requested times
-        run = _after_steps(run)
+        run = run.with_step_rows()
     t, both, grain = run.t, np.array([run.q, run.qd]), 16 * np.finfo(run.model.info.dtype).eps
     intervals = np.diff(t)
     long = np.flatnonzero(intervals > _MIN_ROWS * grain * np.maximum(np.abs(t[:-1]), np.abs(t[1:])))
@@ -240,9 +218,9 @@ def _in_steps(run: Any) -> tuple[Array, Array, Array] | None:
     return np.insert(t[rows], places, at), q, qd
 
 
-def _between_jumps(run: Trajectory) -> tuple[Array, Array, Array]:
+def _between_jumps(run: Any) -> tuple[Array, Array, Array]:
     """Return equidistant t, q, qd in each piece between jumps; each jump has two rows."""
-    run = with_jumps(run)
+    run = run.with_jump_rows()
     n, jumps = len(run.t), 1 + np.flatnonzero(np.diff(run.t) == 0)
     if not len(jumps) or not run.model.functions.has_power:
         even = run if len(jumps) else run.equidistant()
@@ -251,33 +229,15 @@ def _between_jumps(run: Trajectory) -> tuple[Array, Array, Array]:
     times, grain = [], 16 * np.finfo(run.model.info.dtype).eps
     for a, b in zip(firsts.tolist(), lasts.tolist(), strict=True):
         rows = min(
-            max(_ROWS_PER_STEP * (b - a + 1), _MIN_PIECE_ROWS), max(_MAX_ROWS // len(firsts), 2)
+            max(ROWS_PER_STEP * (b - a + 1), _MIN_PIECE_ROWS), max(_MAX_ROWS // len(firsts), 2)
         )
         begin, end = float(run.t[a]), float(run.t[b])
         if end - begin > rows * grain * max(abs(begin), abs(end)):
             times.append(np.linspace(begin, end, rows)[1:-1])
     ends = np.unique([*firsts, *lasts])
-    adaptive: Any = run
-    bare = adaptive.with_rows(run.t[ends], np.array([run.q[ends], run.qd[ends]]))
-    dense: Trajectory = bare.insert_rows(np.concatenate(times)) if times else bare
+    bare = run.with_rows(run.t[ends], np.array([run.q[ends], run.qd[ends]]))
+    dense = bare.insert_rows(np.concatenate(times)) if times else bare
     return dense.t, dense.q, dense.qd
-
-
-def with_jumps(run: Any) -> Any:
-    """Return a run that has two rows at each state jump, one before and one after it.
-
-    A run with events whose rows are at requested times is repeated with a row after each step. Any
-    other run is returned unchanged.
-    """
-    event_indices = getattr(run, "event_data", ((),))[0]
-    if not len(event_indices) or (np.diff(run.t) == 0).any():
-        return run
-    return _after_steps(run)
-
-
-def _after_steps(run: Any) -> Any:
-    """Return the run with a row after each step and both rows of each jump."""
-    return run.rerun(None, float(run.t[-1]) if run.status == "interrupted" else run._t_end)
 
 
 def _in_pieces(t: Array, power: Array, jumps: Array) -> tuple[Array, float]:
@@ -320,9 +280,10 @@ def _work(t: Array, power: Array) -> tuple[Array, Array]:
         for some, k in zip(integrals, strides, strict=True)
     )
     near, far = (np.max(np.abs(x), axis=-1) for x in (whole - half, half - quarter))
+    min_order = 0.5
     with np.errstate(divide="ignore", invalid="ignore"):
-        order = np.log2(far / near)
-    order = np.clip(np.where((near > 0) & (far > 0), order, _MIN_ORDER), _MIN_ORDER, _MAX_ORDER)
+        order = np.where((near > 0) & (far > 0), np.log2(far / near), min_order)
+    order = np.clip(order, min_order, _MAX_ORDER)
     return integrals[0], 3 * near / (2.0**order - 1)
 
 

@@ -6,23 +6,33 @@ Instances run in the lanes of vector registers and in threads; no result depends
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from types import NoneType
+from functools import cached_property
 from typing import Any, Never, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from . import batch_adaptive, batch_fixed
 from .arguments import Array, Start, as_count, as_number, as_step_size, row_times, without_mask
-from .batch_trajectory import BatchRun
-from .batch_work import MIN_STEPS_FOR_THREADS, BatchSteps, Instances, Work
-from .integrator import MIN_CHECKED_NUMBERS
+from .batch_integration import (
+    MIN_STEPS_FOR_THREADS,
+    BatchWork,
+    batch_at_once,
+    integrate_batch,
+)
+from .batch_trajectory import BatchTrajectory
+from .integration import MIN_CHECKED_NUMBERS
 from .model import Model
 from .package import Component, warn, with_events
-from .requests import MAX_EVERY, SimulationArguments, as_progress, step_count
-from .stability import MIN_STEPS
-from .starts import initial_state_for_parameters, is_by_name
-from .status import Interrupted
+from .requests import (
+    Progress,
+    Request,
+    SimulationArguments,
+    StepChoice,
+    as_progress,
+    count_input_periods,
+    cut_to_periods,
+    named_initial_state,
+)
 
 
 class BatchModel(Model):
@@ -41,8 +51,7 @@ class BatchModel(Model):
     @property
     def trajectory_classes(self) -> dict[str, Any]:
         """The classes of runs and batches by their names."""
-        own = (BatchRun, batch_fixed.TimedBatchRun, batch_adaptive.AdaptiveBatchRun)
-        return super().trajectory_classes | {x.__name__: x for x in own}
+        return super().trajectory_classes | {"BatchTrajectory": BatchTrajectory}
 
 
 class Batch(Component):
@@ -50,10 +59,9 @@ class Batch(Component):
 
     Attributes
     ----------
-    count_types : tuple
-        C types of arrays of numbers of steps and of status numbers.
-    step_functions : dict
-        C functions that step many instances, by method; None: the first.
+    has_memory, has_own_parameters : bool
+        Whether C keeps data of an instance between calls, and whether instances may differ in
+        parameters.
     step_seconds : dict
         Measured seconds per step and instance, by function and log2 of the number of instances (few
         instances do not fill a register). They determine the size of chunks, no result.
@@ -63,10 +71,29 @@ class Batch(Component):
 
     def __init__(self, model: BatchModel) -> None:
         self.model, self.info, self.c, self.arguments = model, model.info, model.c, model.arguments
-        self.count_types = (self.c.ffi.typeof("long[]"), self.c.ffi.typeof("int[]"))
-        function = model.integrator.c_function
-        self.step_functions = {x: function(x, "batch_step") for x in (None, *self.info.methods)}
+        self.has_memory = self.info.tolerance is not None or bool(self.info.events)
+        names = dict(self.c.ffi.typeof("run_options").fields)
+        self.has_own_parameters = "p_instance" in names
+        self.count_type, self.status_type = map(self.c.ffi.typeof, ("long[]", "int[]"))
+        self.outputs_type = self.c.ffi.typeof("run_output[]")
         self.step_seconds: dict[Any, float] = {}
+
+    @cached_property
+    def result_type(self) -> np.dtype[Any]:
+        """The type of the results of an instance, numbers of the C struct `run_output`."""
+        ffi, kinds = self.c.ffi, {"long": "l", "int": "i", "double": "d", "float": "f"}
+        members = {
+            name: kinds[field.type.cname]
+            for name, field in ffi.typeof("run_output").fields
+            if field.type.cname in kinds
+        }
+        layout = {
+            "names": list(members), "formats": list(members.values()),
+            "offsets": [ffi.offsetof("run_output", name) for name in members],
+            "itemsize": ffi.sizeof("run_output"),
+        }  # fmt: skip
+        result_type: np.dtype[Any] = np.dtype(layout)  # type: ignore[call-overload]
+        return result_type
 
     def simulate_batch(
         self, q0: Start = None, qd0: Start = None, h: float | None = None,
@@ -77,7 +104,7 @@ class Batch(Component):
         times: ArrayLike | None = None, max_step: float | None = None, stiff: bool = False,
         max_evaluations: int | None = None, events: Mapping[str, Any] | None = None,
         **unknown: Never,
-    ) -> BatchRun:  # fmt: skip
+    ) -> BatchTrajectory:  # fmt: skip
         """Simulate many instances of the scene and return their trajectories.
 
         An instance that cannot continue, or whose initial state cannot be moved onto the
@@ -132,7 +159,7 @@ class Batch(Component):
 
         Returns
         -------
-        BatchRun
+        BatchTrajectory
             Trajectories with q and qd (batch, n, nq), and the status of each instance.
 
         Raises
@@ -144,51 +171,67 @@ class Batch(Component):
         """
         if events is not None or unknown:
             other, arguments = with_events(self.simulate_batch, dict(locals()))
-            return cast(BatchRun, other.batch.simulate_batch(**arguments))
+            return cast(BatchTrajectory, other.batch.simulate_batch(**arguments))
+        choice, integrator = None, self.model.integrator
+        is_plain = max_step is control_period is None and max_evaluations is threads is None
+        if is_plain and progress is None:
+            key = h, duration, steps, every, method, tol, times is not None
+            choice = integrator.plain_steps.find(key)
+        is_short = integrator.has_plain_runs and times is None and stiff is False
+        if choice is not None and is_short and type(t0) is float:
+            run = batch_at_once(self.model, choice, (q0, qd0), t0, u, params)
+            if run is not None:
+                return run
         options = SimulationArguments(
             q0, qd0, h, duration, steps, every, u, params, method, t0, control_period, None,
             as_progress(progress), tol, times, max_step, stiff, threads, max_evaluations,
         )  # fmt: skip
-        if options.uses_adaptive_steps(self.info):
-            return self._finish(*batch_adaptive.simulate(self.model, options))
-        if max_evaluations is not None:
-            raise ValueError("max_evaluations: belongs to adaptive steps: give tol=, and no h=")
-        if self.info.events and not self.model.integrator.ignores_events:
-            return self._finish(*batch_adaptive.simulate_fixed_steps(self.model, options))
-        return self._finish(*self._fixed_steps(options))
-
-    def _fixed_steps(self, options: SimulationArguments) -> tuple[BatchRun, bool]:
-        """Check the arguments of a batch with fixed steps and simulate.
-
-        Return the batch, and False if Ctrl-C interrupted it.
-        """
-        method = self.info.method_name(options.method)
-        h = self.info.h if options.h is None else as_step_size(options.h, self.info.dtype)
-        t0 = as_number(options.t0, "t0")
-        times, steps = options.output_times(t0, h)
-        steps = step_count(self.info, h, options.duration if times is None else None, steps)
-        every = min(as_count(options.every, "every", 1), MAX_EVERY)
-        u, hold = options.inputs_and_hold(self.info, t0, h, steps, 1)
-        batch_adaptive.no_signals(self.model, u, options.control_period)
-        instances = self.instances(options, u, -(-steps // hold), t0)
-        inputs = instances.inputs
-        if inputs is not None and hold > 1 and inputs.shape[1] > 1:
-            inputs = np.ascontiguousarray(np.repeat(inputs, hold, axis=1)[:, :steps])
-            instances = instances._replace(inputs=inputs)
-        if steps >= MIN_STEPS and (method, h) not in self.model.integrator.warned:
-            state = instances.first_state(t0)
-            self.model.integrator.check_step_size(state, h, method, "the first instance: ")
-        plan = BatchSteps(method, h, t0, steps, every)
-        request = batch_fixed.BatchRequest(plan, times, options.threads, options.progress)
-        return batch_fixed.simulate(self.model, instances, request)
-
-    def _finish(self, run: BatchRun, whole: bool) -> BatchRun:
-        """Return the run, with a warning if instances failed. Raises Interrupted unless `whole`."""
-        if not whole:
-            raise Interrupted(run)
-        if words := run.failure_summary:
-            warn(f"{self.info.name}: {words}")
+        if threads is not None:
+            as_count(threads, "threads", 1)
+        request, codes = self._request(options, choice)
+        run = self.integrate(request, codes, threads, options.progress)
+        if np.count_nonzero(run.status_codes):
+            warn(f"{self.info.name}: {run.failure_summary}")
         return run
+
+    def integrate(
+        self, request: Request, codes: Array | None = None, threads: int | None = None,
+        progress: Progress = None,
+    ) -> BatchTrajectory:  # fmt: skip
+        """Make a batch from checked arguments and return it, as `integrate_batch`."""
+        return integrate_batch(self.model, request, codes, threads, progress)
+
+    def states_from(
+        self, request: Request, state: Array, first: int, codes: Array, rows: Array
+    ) -> None:
+        """Compute states of a batch at the times of the request, from those after `first` steps.
+
+        state: [q, qd] after these steps, (2, batch, nq), which is overwritten. codes: status number
+        of each instance; others than 0 make no step. rows: the states, (2, batch, n, nq).
+        """
+        work = BatchWork(self.model, request, state, rows, request.times, codes, first=first)
+        work.run(None, None)
+        work.finish_rows()
+
+    def _request(
+        self, options: SimulationArguments, choice: StepChoice | None
+    ) -> tuple[Request, Array | None]:
+        """Check the arguments of `simulate_batch`; warn of a step size that is too large.
+
+        choice: checked steps from t = 0, if known. Return the request, and the status numbers of
+        instances that cannot start, or None. Raises ValueError if an argument is invalid.
+        """
+        info, integrator = self.info, self.model.integrator
+        steps = integrator.checked_steps(options, choice)
+        hold = count_input_periods(info, steps, options.control_period)
+        if options.u is None and options.control_period is not None and info.nu:
+            raise ValueError("control_period: a batch follows the signals: give u, a row a period")
+        u = cut_to_periods(info, options, steps, hold, 1)
+        q, qd, p, inputs, codes = self.instances(options, u, hold[1] or None, steps.t0)
+        inputs = None if inputs is None else inputs.copy()
+        request = steps.request(q, qd, (inputs, *hold), p.copy())
+        integrator.check_step_size(request, "the first instance: ")
+        return request, codes
 
     def step_batch(
         self, q: Array, qd: Array, h: float | None = None, t: ArrayLike = 0.0,
@@ -234,7 +277,7 @@ class Batch(Component):
         KeyboardInterrupt
             At Ctrl-C.
         """
-        if not isinstance(method, (str, NoneType)) or method not in self.step_functions:
+        if method is not None:
             self.info.method_name(method)  # raises, with those there are
         if out is not None:
             into = self.arguments.output_pair(out, np.shape(q))
@@ -266,37 +309,45 @@ class Batch(Component):
             count * steps >= MIN_STEPS_FOR_THREADS
             or count * steps * self.info.nq > 8 * MIN_STEPS_FOR_THREADS
         ):
-            table = self.arguments.parameter_rows(params)
-            plan = BatchSteps(method, h, t if times is None else times, steps)
-            work = Work(self.model, plan, (q, qd), Instances(None, table, inputs))
+            table, method = self.arguments.parameter_rows(params), method or self.info.methods[0]
+            t0 = as_number(t, "t") if times is None else 0.0
+            inputs_and_method = (inputs, 0.0, 0, table, method)
+            request = Request(q, qd, t0, 0.0, h, steps, 1, None, *inputs_and_method)
+            work = BatchWork(self.model, request, (q, qd), starts=times)
             if not work.run(threads, None):
                 raise KeyboardInterrupt
-            return work.status
+            return np.array(work.results["status"])
         # too few steps for threads and for checks of Ctrl-C: call C directly
         address, real, null = self.c.tools
         status = np.empty(count, "i")
-        self.step_functions[method](
-            count, address(real, q), address(real, qd),
-            [t] if times is None else address(real, times), int(times is not None), h, steps,
+        self.c.lib.step_batch(
+            0 if method is None else self.info.methods.index(method), count, address(real, q),
+            address(real, qd), null if times is None else address(real, times),
+            t if times is None else 0.0, h, steps, 1,
             null if inputs is None else address(real, inputs),
-            self.info.nu if inputs is not None and len(inputs) > 1 else 0,
+            self.info.nu if inputs is not None and len(inputs) > 1 else 0, 0,
             self.arguments.default_pointers[2] if table is None else address(real, table),
-            1 if table is not None and len(table) > 1 else 0, address(self.count_types[1], status),
+            1 if table is not None and len(table) > 1 else 0, null, 0, null,
+            address(self.status_type, status),
         )  # fmt: skip
         return status
 
     def instances(
         self, options: SimulationArguments, u: Any, steps: int | None, t0: float
-    ) -> Instances:
+    ) -> tuple[Array, Array, Array, Array | None, Array | None]:
         """Check the initial states, parameters and inputs of a batch.
+
+        Return positions and velocities, (batch, nq) each; parameters, (batch or 1, np); inputs,
+        (batch or 1, steps or 1, nu), or None for the scene's signals; and status numbers, or None
+        if all instances can start. Initial states may be the caller's arrays, and contain numbers
+        that are not finite.
 
         u: inputs, cut to the steps of the run. steps: number of rows of a table of inputs. t0:
         time, s, at which the initial states are assembled on the constraints.
         """
         q0, qd0, params = options.q0, options.qd0, options.params
         start, table = self.info.initial_state, self.arguments.parameter_rows(params)
-        if (params is not None and self.info.start_formulas) or is_by_name(q0, qd0):
-            q0, qd0 = initial_state_for_parameters(self.model, q0, qd0, table, many_values=True)
+        q0, qd0 = named_initial_state(self.model, q0, qd0, params, many=True)
         q = self._state_rows(start[0] if q0 is None else self.info.with_discrete(q0, 0), "q0")
         qd = self._state_rows(start[1] if qd0 is None else self.info.with_discrete(qd0, 1), "qd0")
         inputs = self.input_rows(u, steps)
@@ -324,7 +375,7 @@ class Batch(Component):
         whole = (count, self.info.nq)  # broadcast_to is slow even without effect
         q, qd = (x if x.shape == whole else np.broadcast_to(x, whole) for x in (q, qd))
         q, qd, codes = self.model.constraints.assemble_rows(q, qd, table, t0)
-        return Instances((q, qd), table, inputs, codes)
+        return q, qd, table, inputs, codes
 
     def _state_rows(self, values: ArrayLike, name: str) -> Array:
         """Return states (nq,) or (n, nq); an array (n, nq) is returned without further checks."""

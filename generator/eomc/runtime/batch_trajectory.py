@@ -2,42 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Sequence
+from copy import copy
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from .arguments import Array, ByName
+from .arguments import Array
 from .atomic_write import File
-from .batch_work import BatchStepper, BatchSteps, Instances
 from .columns import Columns
 from .interfaces import CompiledBatchModel
-from .package import own_model, reduced, require_eomc
-from .status import STATUS, STATUS_MESSAGES
-from .trajectory_data import parts, within
+from .package import require_eomc
+from .requests import Request, count_steps, split_times
+from .status import FULL, STATUS
+from .trajectory import failure_message
 
-_ENDS = np.array(STATUS)
-# keys of saved fields, in order
-_FIELDS = "t0 q qd h steps codes every wanted params held method _u".split()
+_STATUSES = np.array([*STATUS, FULL])
 _SINGLE_RUN_ATTRIBUTES = {
     "balance": "balance()", "estimate": "estimate()", "error": "estimate()",
     "section": "section(...)",
 }  # fmt: skip
+COUNTERS = ("steps", "evaluations", "rejected", "stiff_steps", "status_codes")  # as C counts
 _SINGLE_RUN_ARGUMENTS = {"phase", "section", "other", "labels"}
 _ROWS_PER_CALL = 2**16  # rows of all instances in a call, which fit in the cache
+_EVALUATIONS_PER_STATE = 8 * 64  # for a state between two steps: stages times iterations, at most
 
 
 @dataclass(eq=False, repr=False)
-class BatchRun(Columns):
+class BatchTrajectory(Columns):
     """Trajectories of many instances of a scene, returned by `simulate_batch`.
 
-    All instances have rows at the same n times. A row is stored if the instance completed the steps
-    to its time; the rows of an instance after its failure are nan. Columns are available by name:
-    run["theta_dot"] has the shape (batch, n). Two runs are equal if scene, settings and rows are
-    equal bit by bit.
+    All instances have rows at the same n times. The rows of an instance after its failure are nan.
+    A requested time may lie between two fixed steps; the state there is computed by a shorter step
+    that begins at the earlier of the two. Columns are available by name: run["theta_dot"] has the
+    shape (batch, n). The names of SciPy's solve_ivp are understood: success, message, t, sol, nfev,
+    t_events and y_events. Two batches are equal if their scenes, arguments except inputs, rows,
+    events and counters are equal, bit by bit.
 
     Attributes
     ----------
@@ -48,165 +50,102 @@ class BatchRun(Columns):
     u : (batch, n, nu) array
         Applied inputs.
     status : (batch,) array of str
-        "ok", "singular", "not finite", "no convergence", "locked" or "interrupted". For an initial
-        state that cannot be moved onto the constraints ("locked"), the first row is the initial
-        state of the caller.
+        "ok", "singular", "not finite", "no convergence", "locked", "accumulated", "too long" or
+        "interrupted". For an initial state that cannot be moved onto the constraints ("locked"),
+        the first row is the initial state of the caller.
+    success : (batch,) array of bool
+        True for the status "ok".
+    message : str
+        Numbers of instances, of steps, and of instances by status.
+    sol : callable
+        sol(t) are the states [q; qd] at a time or at times, (batch, 2 nq) or (batch, 2 nq, n).
+    nfev, evaluations : (batch,) array of int
+        Number of evaluations of the accelerations of each instance.
+    t_events, y_events : list of arrays
+        Times (m,), s, and states [q; qd] (m, 2 nq) of the occurrences of each event.
+    events : dict of BatchEventLog
+        Occurrences of each event, by the event's name: times t, states q, qd and instances, sorted
+        by instance.
     steps : (batch,) array of int
         Number of steps that each instance completed.
     t0, h : float
-        Start time and step size, s.
+        Start time and size of fixed steps or mean size of adaptive steps, s.
     every : int
-        Number of steps between two rows.
+        Number of fixed steps between two rows, without requested times.
     method : str
         Name of the integration method.
+    tol : float
+        Tolerance of adaptive steps; 0 for fixed steps.
+    rejected, stiff_steps : (batch,) arrays of int
+        Numbers of rejected steps, and of steps by Newton's method of each instance.
+    reached : (batch,) array
+        Time that each instance reached, s. Rows at later times are nan. An instance ends early
+        after a failure, at an event that stops it, or after `max_evaluations` (status "too long").
+    stopped : (batch,) array of str
+        Name of the event that ended each instance, or "".
+    limit : (batch,) array
+        Time at which the events of each instance accumulate (Zeno behaviour), s; nan unless its
+        status is "accumulated".
+    request : Request
+        The checked arguments with which the batch was made.
     """
 
     _axes = ("instance", "t")
+    period_inputs = None
     model: CompiledBatchModel
-    t0: float
-    q: Array
-    qd: Array
-    h: float
+    request: Request
+    rows: Array | tuple[Array, Array]  # q and qd, (batch, n, nq)
     steps: Array
     status_codes: Array
-    every: int
-    _requested_steps: int
-    parameter_values: Array  # (batch or 1, np)
-    row_inputs: Array | None  # at the rows, (batch or 1, n or 1, nu)
-    method: str
-    input_source: Array | None = (
-        None  # (batch or 1, steps or 1, nu), if _row_inputs has only a part of it
-    )
-
-    @cached_property
-    def t(self) -> Array:
-        """Return the times of the rows, (n,), s, which are the same for all instances."""
-        steps = np.minimum(np.arange(self.q.shape[1]) * self.every, self._requested_steps)
-        return np.asarray(self.t0 + self.h * steps)
+    evaluations: Array
+    rejected: Array
+    stiff_steps: Array
+    times: Array | None = field(default=None, init=False)  # None: multiples of `every` steps
+    end_time: Array | None = field(default=None, init=False)  # None: those of `steps` steps
+    event_data: tuple[Array, Array, Array] | None = field(default=None, init=False)
+    stopped_codes: Array | None = field(default=None, init=False)  # 1 + index of the event, or 0
+    limits: Array | None = field(default=None, init=False)
 
     @cached_property
     def status(self) -> Array:
-        """Return the status of each instance as text, (batch,), such as "ok" or "singular"."""
-        return np.asarray(_ENDS[self.status_codes])
+        """Status of each instance as text, (batch,), such as "ok" or "singular"."""
+        return np.asarray(_STATUSES[self.status_codes])
 
     @property
-    def u(self) -> Array:
-        """Return the inputs applied at each row, (batch, n, nu), limited to their allowed ranges.
-
-        At each row they are the values of the scene's signals, or the constant inputs of the step
-        that begins there. The last row has the inputs of the last step.
-        """
-        return self._within(self.requested_inputs)
+    def h(self) -> float:
+        """Size of fixed steps, or mean size of adaptive steps, s."""
+        request = self.request
+        return request.h or (request.t_end - request.t0) / max(1.0, float(self.steps.mean()))
 
     @property
-    def saturated(self) -> Array:
-        """Return whether each input exceeds its limits at each row, as a bool array (batch, n, nu).
-
-        The inputs are compared before they are limited. Values are False at rows that are nan.
-        """
-        inputs = self.requested_inputs
-        return np.asarray(np.abs(inputs - self._within(inputs)) > 0)
-
-    def _within(self, u: Array) -> Array:
-        """Saturate inputs (batch, n, nu) at the limits of their instances."""
-        return self.model.functions.saturate(u, self.parameter_values)
+    def stopped(self) -> Array:
+        """Name of the event that ended each instance, (batch,); "" if none did."""
+        codes = np.zeros(len(self), int) if self.stopped_codes is None else self.stopped_codes
+        return np.asarray(np.array(["", *self.model.info.events])[codes])
 
     @property
-    def requested_inputs(self) -> Array:
-        """Inputs at each row before saturation, (batch, n, nu)."""
-        if self.row_inputs is None:
-            return self.evaluate(self.model.functions.signal, (self.model.info.nu,))
-        inputs = np.broadcast_to(self.row_inputs, (*self.q.shape[:2], self.model.info.nu)).copy()
-        inputs[np.isnan(self.q[..., 0])] = np.nan
-        return inputs
+    def limit(self) -> Array:
+        """Time at which the events of each instance accumulate, (batch,), s; nan for all others."""
+        return np.full(len(self), np.nan) if self.limits is None else self.limits
 
     @property
-    def energy(self) -> Array:
-        """Return the energy K + P (kinetic and potential) at each row, (batch, n), J.
+    def _last_step(self) -> int:
+        request = self.request
+        if self.times is None or not request.has_equal_steps:
+            return request.steps
+        return int(split_times(self.times[-1:], request.t0, request.h)[0][0])
 
-        In a rotating frame, `jacobi` is conserved instead of the energy.
+    def evaluate(self, function: Callable[..., Any], *, has_inputs: bool = False) -> Array:
+        """Evaluate a function of the state, and of the inputs if it has them, at each row.
+
+        The result, (batch, n, ...), is nan at rows that are nan.
         """
-        return self.evaluate(self.model.functions.energy, ())
-
-    @property
-    def jacobi(self) -> Array:
-        """Return the Jacobi integral qd.dK/dqd - K + P at each row, (batch, n), J.
-
-        It equals the energy if the kinetic energy K is purely quadratic in qd.
-        """
-        return self.evaluate(self.model.functions.jacobi, ())
-
-    @cached_property
-    def outputs(self) -> dict[str, Array]:
-        """Return the outputs of the scene as a dict from name to array (batch, n).
-
-        Values are nan at rows that are nan. Outputs that depend on accelerations are also nan at
-        states with a singular mass matrix D.
-        """
-        names = self.model.info.outputs
-        if not names:
-            return {}
-        values = self._evaluate_with_inputs(self.model.functions.output, (len(names),))
-        return dict(zip(names, np.ascontiguousarray(np.moveaxis(values, 2, 0)), strict=True))
-
-    @property
-    def constraints(self) -> Mapping[str, Array]:
-        """Return the residual of each constraint equation as a dict from name to array (batch, n).
-
-        A residual is 0 if the equation is satisfied; its unit is that of the equation. Raises
-        KeyError for unknown names.
-        """
-        model, names = self.model, self.model.info.constraints.names
-        return _by_name(
-            "constraints", names,
-            lambda: self.evaluate(model.constraints.constraints, (len(names),)),
-        )  # fmt: skip
-
-    @property
-    def multipliers(self) -> Mapping[str, Array]:
-        """Return the Lagrange multiplier of each constraint as a dict from name to (batch, n).
-
-        Raises KeyError for unknown names.
-        """
-        model, names = self.model, self.model.info.constraints.names
-        return _by_name(
-            "multipliers", names,
-            lambda: self._evaluate_with_inputs(model.constraints.multipliers_or_nan, (len(names),)),
-        )  # fmt: skip
-
-    @property
-    def reactions(self) -> Mapping[str, Array]:
-        """Return the reaction of each loop's joint on its second body, by the loop's name.
-
-        A loop is a [[loop]] of the scene: a joint that closes a kinematic chain. Its reaction is
-        the force, N, and the moment about the joint's point, N m, along the axes of the world, as
-        an array (batch, n, 6). In plane scenes the array is (batch, n, 3), with two components of
-        the force and the moment.
-        """
-        model, loops = self.model, self.model.info.constraints.loops
-        shape = (len(loops), 3 if model.info.plane else 6)
-        return _by_name(
-            "reactions",
-            loops,
-            lambda: self._evaluate_with_inputs(model.constraints.reactions_or_nan, shape),
-        )
-
-    def _evaluate_with_inputs(self, function: Callable[..., Any], shape: tuple[int, ...]) -> Array:
-        """Evaluate a function of the state and the inputs at all rows."""
-        return self.evaluate(
-            function, shape, None if self.row_inputs is None else {"u": self.row_inputs}
-        )
-
-    def evaluate(
-        self, function: Callable[..., Any], shape: tuple[int, ...],
-        inputs: Mapping[str, Array] | None = None,
-    ) -> Array:  # fmt: skip
-        """Evaluate a function at all rows, (batch, n, ...), nan at rows that are nan."""
         count, n = self.q.shape[:2]
-        results = np.full((count, n, *shape), np.nan, self.model.info.dtype)
-        t, each = np.broadcast_to(self.t, (count, n)), {"params": self.parameter_values[:, None]}
-        each |= inputs or {}
+        t, each = np.broadcast_to(self.t, (count, n)), {"params": self.request.p[:, None]}
+        if has_inputs and (u := self._row_inputs()) is not None:
+            each["u"] = u
         alike = {name: x.size == x.shape[-1] for name, x in each.items()}
+        results: Any = None
         for first in range(0, count, many := max(1, _ROWS_PER_CALL // max(n, 1))):
             at = slice(first, first + many)
             q, qd = self.q[at], self.qd[at]
@@ -219,67 +158,73 @@ class BatchRun(Columns):
                 for name, x in each.items()
             }
             values = function(_rows(q[here]), _rows(qd[here]), t=t[at][here].ravel(), **arguments)
+            if results is None:
+                results = np.full((count, n, *values.shape[1:]), np.nan, self.model.info.dtype)
             results[at][here] = values.reshape(results[at][here].shape)
-        return results
-
-    def __call__(self, t: ArrayLike) -> tuple[Array, Array]:
-        """Return the positions and velocities of all instances at any times within the run.
-
-        The steps from the preceding row, or all steps, are repeated, so the states are as accurate
-        as the run.
-
-        Parameters
-        ----------
-        t : array_like, (...)
-            Times, s.
-
-        Returns
-        -------
-        q, qd : (batch, ..., nq) arrays
-            nan at times after the end of an instance.
-
-        Raises
-        ------
-        ValueError
-            If a time is outside of the run.
-        """
-        times = within(self, t)
-        unique_times, place = np.unique(times, return_inverse=True)
-        q, qd = self._states(unique_times)[:, :, place.ravel()]
-        shape = (len(self), *times.shape, self.model.info.nq)
-        return q.reshape(shape), qd.reshape(shape)
+        return np.asarray(results)
 
     def _states(self, times: Array) -> Array:
-        """Return states (2, batch, n, nq) at ascending times, from the row before each."""
-        inputs, every = (
-            self.row_inputs if self.input_source is None else self.input_source,
-            self.every,
-        )
-        whole, rest = parts(times, self.t0, self.h, self._requested_steps)
-        rows = np.empty((2, len(self), len(times), self.model.info.nq), self.model.info.dtype)
-        for row in np.unique(whole // every):
-            own, first = (whole // every == row).nonzero()[0], int(row) * every
-            stepper = stepper_for(self, np.array([self.q[:, row], self.qd[:, row]]), inputs, first)
-            stepper.work.status[self.steps < first] = STATUS.index(
-                "not finite"
-            )  # instances that did not reach this row
-            here = slice(own[0], own[-1] + 1)
-            stepper.rows((whole[own], rest[own]), rows[:, :, here])
+        request, n = self.request, len(times)
+        batch, codes = self.model.batch, self._initial_failures()
+        if not request.has_equal_steps:
+            limit = request.max_evaluations
+            if limit:  # without those of states between steps
+                each = _EVALUATIONS_PER_STATE + 2 * self.model.info.nq + 1
+                limit += each * (n + len(self.t))
+            times = times.astype(self.model.info.dtype)
+            request = request.replace(times=times, max_evaluations=limit)
+            rows = np.array(batch.integrate(request, codes).rows)
+            # instances with status "too long" do not get beyond their end
+            ended = np.where(self.status_codes == STATUS.index("too long"), self.reached, np.inf)
+            rows[:, times > ended[:, None]] = np.nan
+            return rows
+        if self.times is not None:
+            steps = count_steps(times, request.t0, request.h)
+            return np.array(batch.integrate(request.replace(times=times, steps=steps), codes).rows)
+        rows = np.empty((2, len(self), n, self.model.info.nq), self.model.info.dtype)
+        whole = split_times(times, request.t0, request.h, request.steps)[0]
+        for row in np.unique(whole // request.every):
+            own, first = (whole // request.every == row).nonzero()[0], int(row) * request.every
+            state = np.array([self.q[:, row], self.qd[:, row]])
+            unreached = np.where(self.steps < first, STATUS.index("not finite"), codes)
+            some = np.empty((2, len(self), len(own), self.model.info.nq), self.model.info.dtype)
+            batch.states_from(request.replace(times=times[own]), state, first, unreached, some)
+            rows[:, :, own[0] : own[-1] + 1] = some
         return rows
+
+    def _initial_failures(self) -> Array:
+        """Return the status number of each instance that failed at its initial state, else 0."""
+        failed = (self.steps == 0) & (self.status_codes < STATUS.index("interrupted"))
+        return np.where(failed, self.status_codes, 0)
+
+    def select(self, numbers: Sequence[int]) -> BatchTrajectory:
+        """Return a batch of the instances with these numbers (indices)."""
+        count, run, request = len(self), copy(self), self.request
+
+        def chosen(values: Any) -> Any:
+            own = values is not None and len(values) == count > 1
+            return values[numbers] if own else values
+
+        own_fields = {name: chosen(getattr(request, name)) for name in ("q", "qd", "p", "u")}
+        run.request, run.rows = request.replace(**own_fields), (self.q[numbers], self.qd[numbers])
+        names = ("steps", "status_codes", "evaluations", "rejected", "stiff_steps", "end_time",
+                 "stopped_codes", "limits")  # fmt: skip
+        run.__dict__.update({name: chosen(getattr(self, name)) for name in names})
+        if self.event_data is not None:
+            of = [np.flatnonzero(self.event_data[0] == k) for k in numbers]
+            whose = np.repeat(np.arange(len(of)), [len(rows) for rows in of])
+            rows = np.concatenate(of)
+            run.event_data = whose, self.event_data[1][rows], self.event_data[2][rows]
+        return run
 
     def __getattr__(self, name: str) -> Any:
         """Return a column of the scene; the error for attributes of single runs has a hint."""
+        if name in COUNTERS and "counts" in self.__dict__:  # at the first access
+            self.__dict__.update(zip(COUNTERS, self.counts, strict=True))
+            return self.__dict__[name]
         if name in _SINGLE_RUN_ATTRIBUTES and name not in self._named():
             raise AttributeError(f"{name} {single_run_hint(self)}.{_SINGLE_RUN_ATTRIBUTES[name]}")
         return super().__getattr__(name)
-
-    @property
-    def events(self) -> Mapping[str, Any]:
-        """Return the occurrences of each event as a dict by the event's name.
-
-        The dict is empty for scenes without events.
-        """
-        return ByName("events", (), ())
 
     def plot(
         self, *names: str, quantiles: Sequence[float] = (0.05, 0.25, 0.5, 0.75, 0.95),
@@ -301,7 +246,7 @@ class BatchRun(Columns):
             Draw the final value of each instance instead, over "instance" (its index), a parameter
             or these numbers.
         wrap, ax, axes, file, **style
-            As in `Run.plot`.
+            As in `Trajectory.plot`.
 
         Returns
         -------
@@ -320,10 +265,10 @@ class BatchRun(Columns):
         """
         for name in _SINGLE_RUN_ARGUMENTS & style.keys():
             raise TypeError(f"plot: {name}= {single_run_hint(self)}.plot({name}=...)")
-        from .plot import FanOptions, draw_fan
+        from .plot import Figure, draw_fan
 
-        options = FanOptions(quantiles, lines, over, wrap, ax, axes, file, style)
-        return draw_fan(self, names, options)
+        figure = Figure(wrap, ax, axes, file, style)
+        return draw_fan(self, names, figure, quantiles, lines, over)
 
     def animate(
         self, file: File | None = None, *, names: Sequence[str] = (),
@@ -363,29 +308,19 @@ class BatchRun(Columns):
         page = require_eomc("report.animation")
         return page.instances(self, file, names=names, chosen=instances, scene=scene, title=title)
 
-    def to_arrays(self) -> dict[str, Any]:
-        """Return the data of a saved run by name; None: not saved."""
-        return dict(zip(_FIELDS, self.field_values()[1:], strict=True))
-
-    @classmethod
-    def from_arrays(cls, model: CompiledBatchModel, arrays: Mapping[str, Any]) -> BatchRun:
-        """Create the run from the arrays and numbers of `to_arrays`, read from a file."""
-        values: Any = map(arrays.get, _FIELDS)
-        return cls(model, *values)
-
-    @classmethod
-    def _of_pickled(cls, arrays: Mapping[str, Any]) -> BatchRun:
-        return cls.from_arrays(own_model(), arrays)
-
     @property
     def message(self) -> str:
         """Return a sentence with the numbers of instances, of steps and of instances by status."""
         names, counts = np.unique(self.status, return_counts=True)
         statuses = ", ".join(f"{c} {n}" for n, c in zip(names, counts, strict=True))
-        step_count = int(self.steps.sum())
-        total_steps = len(self) * self._requested_steps
-        steps = f"{step_count} of {total_steps} steps of {self.h:g} s"
-        return f"{len(self)} instances, {steps}: {statuses}"
+        steps = f"{int(self.steps.sum())}"
+        if self.request.has_equal_steps:
+            steps += f" of {len(self) * self._last_step}"
+        names, counts = np.unique(self.stopped, return_counts=True)
+        ends = zip(counts, names, strict=True)
+        stops = "".join(f", {c} stopped by '{n}'" for c, n in ends if n)
+        how = f", tolerance {self.tol:g}" if self.tol else f" of {self.h:g} s"
+        return f"{len(self)} instances, {steps} steps{how}: {statuses}{stops}"
 
     @property
     def failure_summary(self) -> str:
@@ -393,80 +328,24 @@ class BatchRun(Columns):
         if not self.status_codes.any():
             return ""
         k = int(self.status_codes.nonzero()[0][0])
-        first = f"the first that could not go on, instance {k}, stopped at t = {self._end(k):.9g}"
-        return f"{self.message}; {first}: {self._why(k)}"
+        end = float(self.reached[k])
+        first = f"the first that could not go on, instance {k}, stopped at t = {end:.9g}"
+        return f"{self.message}; {first}: {self._failure_reason(k)}"
 
-    def _end(self, k: int) -> float:
-        """Return the time that instance k reached, s."""
-        return float(self.t0 + self.h * self.steps[k])
-
-    def _why(self, k: int) -> str:
+    def _failure_reason(self, k: int) -> str:
         """Return the reason why instance k failed."""
-        return STATUS_MESSAGES[str(_ENDS[self.status_codes[k]])]
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        kind = type(self)
-        path = f"{kind.__module__.rpartition('.')[2]}.{kind.__name__}._of_pickled"
-        return reduced(path, self.to_arrays())
-
-    def field_values(self) -> tuple[Any, ...]:
-        """Return the values of the fields that the base class `BatchRun` has, in order."""
-        return tuple(getattr(self, each.name) for each in fields(self))
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, BatchRun):
-            return NotImplemented
-        alike = self.settings() == other.settings()
-        both = zip(self.arrays(), other.arrays(), strict=True)
-        return alike and all(np.array_equal(a, b, equal_nan=True) for a, b in both)
-
-    __hash__ = None  # type: ignore[assignment]  # rows may be changed
-
-    def settings(self) -> tuple[Any, ...]:
-        """Return the settings of the run that have to agree for two runs to be equal."""
-        model = self.model
-        return (
-            model.info.name,
-            model.info.digest,
-            self.t0,
-            self.h,
-            self.every,
-            self._requested_steps,
-            self.method,
-        )
-
-    def arrays(self) -> tuple[Array, ...]:
-        """Return the arrays of the batch that have to agree for two batches to be equal."""
-        inputs = np.empty(0) if self.row_inputs is None else self.row_inputs
-        return self.q, self.qd, self.steps, self.status_codes, self.parameter_values, inputs
+        status, event = str(self.status[k]), self.stopped[k]
+        if status == "not finite" and event:
+            return f"event '{event}' jumps to no finite state"
+        if status == "accumulated":
+            return f"jumps follow one another ever sooner, up to t = {self.limit[k]:.15g} s"
+        return failure_message(self.model, status, self.tol > 0)
 
     def __len__(self) -> int:
         return len(self.status_codes)
 
     def __repr__(self) -> str:
-        return f"<BatchRun of {self.model.info.name}: {self.message}>"
-
-
-def initial_failures(run: BatchRun) -> Array:
-    """Return the status number of each instance that failed at its initial state, (batch,).
-
-    The number is 0 for all other instances.
-    """
-    return np.where(
-        (run.steps == 0) & (run.status_codes < STATUS.index("interrupted")), run.status_codes, 0
-    )
-
-
-def stepper_for(run: BatchRun, both: Array, inputs: Array | None, first: int = 0) -> BatchStepper:
-    """Return a stepper that continues a batch with fixed steps from given states.
-
-    run: the batch. both: states [q, qd] of all instances after `first` steps, (2, batch, nq).
-    inputs: inputs of the steps, (batch or 1, steps or 1, nu); None: the scene's signals. The
-    stepper does not advance instances that failed at their initial state.
-    """
-    instances = Instances(None, run.parameter_values, inputs, initial_failures(run))
-    plan = BatchSteps(run.method, run.h, run.t0, first)
-    return BatchStepper(run.model, plan, both, instances)
+        return f"<BatchTrajectory of {self.model.info.name}: {self.message}>"
 
 
 def single_run_hint(runs: Any) -> str:
@@ -481,8 +360,3 @@ def single_run_hint(runs: Any) -> str:
 def _rows(x: Array) -> Array:
     """Reshape (..., m) to rows (n, m)."""
     return x.reshape(-1, x.shape[-1]) if x.shape[-1] else x.reshape(int(np.prod(x.shape[:-1])), 0)
-
-
-def _by_name(what: str, names: Sequence[str], rows: Callable[[], Array]) -> ByName:
-    """Return the values of `rows`, (batch, n, names, ...), by name."""
-    return ByName(what, names, np.ascontiguousarray(np.moveaxis(rows(), 2, 0)) if names else ())

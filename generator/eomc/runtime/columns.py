@@ -1,4 +1,4 @@
-"""Columns of a run by name: as items, attributes, a dict, a file, pandas or xarray tables.
+"""Columns of runs by name, and what single runs and batches have in common.
 
 The names are t, the scene's coordinates, their rates (`theta_dot`), its inputs and outputs, energy,
 and jacobi where that is not the energy.
@@ -7,33 +7,356 @@ and jacobi where that is not the energy.
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterable
-from functools import partial
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cached_property, partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from .arguments import Array, not_one_of
+from . import saved
+from .arguments import Array, ByName, as_numbers, not_one_of
 from .atomic_write import File, atomic_write
-from .interfaces import CompiledModel
+from .events import BatchEventLog, EventLog
+from .package import reduced
+from .requests import Request, period_starts, split_times
+
+ROWS_PER_STEP = 8  # equidistant rows for each step of various sizes, for curves and integrals
+
+
+class _Half:
+    """q or qd of a run: a half of its rows, computed at the first access and stored."""
+
+    def __init__(self, index: int) -> None:
+        self.index = index
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, run: Columns | None, owner: type) -> Array:
+        if run is None:
+            return self  # type: ignore[return-value]  # access on the class, as by help()
+        half: Array = run.rows[self.index]
+        run.__dict__[self.name] = half
+        return half
 
 
 class Columns:
-    """Mixin of runs: access to columns by name, and their conversion to tables and files.
+    """Common part of `Trajectory` and `BatchTrajectory`: their rows, and quantities at the rows.
 
     A column is a quantity at all rows: the time t (n,), a coordinate, its velocity (`theta_dot` for
     the coordinate theta), an input, an output, the energy or the Jacobi integral. For a batch all
     columns but t have the shape (batch, n).
     """
 
-    model: CompiledModel
-    outputs: Any  # by name
-    parameter_values: Array
+    model: Any
+    request: Request
+    origin: Any  # of a short run, of which its request is created at the first access
+    counts: Any  # of a short batch, of each instance
+    rows: Any
+    steps: Any
+    evaluations: Any
+    times: Array | None
+    end_time: Any
+    period_inputs: Array | None
+    event_data: tuple[Array, ...] | None
+    status: Any
     __len__: Callable[[], int]
     _axes: ClassVar[tuple[str, ...]] = ("t",)
     __iter__ = None  # `for name in run` would ask for run[0]
+    __hash__ = None  # type: ignore[assignment]  # rows may be changed
+
+    q, qd = _Half(0), _Half(1)
+
+    @cached_property
+    def t(self) -> Array:
+        """Times of the rows, (n,), s."""
+        if self.times is not None:
+            return self.times
+        request, n = self.request, self.q.shape[-2]
+        steps = np.arange(n)
+        if request.every > 1:
+            steps = np.minimum(request.every * steps, self._last_step)
+        return np.asarray(request.t0 + request.h * steps)
+
+    @property
+    def _last_step(self) -> int:
+        """Number of fixed steps up to the last row."""
+        return int(self.steps)
+
+    @property
+    def reached(self) -> Any:
+        """Time that the run reached, s; for a batch of each instance, (batch,)."""
+        return self.t0 + self.request.h * self.steps if self.end_time is None else self.end_time
+
+    @cached_property
+    def events(self) -> Mapping[str, Any]:
+        """Occurrences of each event of the scene, as a dict from name to `EventLog`.
+
+        An `EventLog` has the times t (m,), s, and the states q, qd (m, nq) at the occurrences; that
+        of a batch, a `BatchEventLog`, has the indices of the instances (m,) as well. At a state
+        jump, the state is that before the jump. The dict is empty without events.
+        """
+        if self.event_data is None:
+            return ByName("events", (), ())
+        *instances, which, rows = self.event_data
+        names, logs = self.model.info.events, list[EventLog]()
+        for own in (which == k for k in range(len(names))):
+            t, q, qd = np.split(rows[own], [1, 1 + self.model.info.nq], axis=1)
+            log: tuple[Array, Array, Array] = (t[:, 0], q, qd)
+            if instances:
+                logs.append(BatchEventLog(*log, instances[0][own], len(self)))
+            else:
+                logs.append(EventLog(*log))
+        return ByName("events", names, logs)
+
+    @property
+    def t0(self) -> float:
+        """Start time, s."""
+        return self.request.t0
+
+    @property
+    def every(self) -> int:
+        """Number of fixed steps from one row to the next."""
+        return self.request.every
+
+    @property
+    def method(self) -> str:
+        """Name of the integration method."""
+        return self.request.method
+
+    @property
+    def tol(self) -> float:
+        """Tolerance of adaptive steps; 0 for fixed steps."""
+        return self.request.tol
+
+    @property
+    def success(self) -> Any:
+        """True if the status is "ok", as in SciPy; for a batch an array (batch,) of bool."""
+        return self.status == "ok"
+
+    @property
+    def nfev(self) -> Any:
+        """Number of evaluations of the accelerations, as in SciPy: `evaluations`."""
+        return self.evaluations
+
+    @property
+    def t_events(self) -> list[Array]:
+        """Times of the occurrences of each event, s, as in SciPy: a list of arrays (m,)."""
+        return [log.t for log in self.events.values()]
+
+    @property
+    def y_events(self) -> list[Array]:
+        """States [q; qd] at the occurrences of each event, as in SciPy: a list of (m, 2 nq)."""
+        return [np.concatenate([log.q, log.qd], axis=1) for log in self.events.values()]
+
+    def __call__(self, t: ArrayLike) -> tuple[Array, Array]:
+        """Return the positions and velocities at any times within the run.
+
+        They are as accurate as the run: steps of the same method, from the row before or from the
+        start, end at these times. A state at a state jump is that before the jump.
+
+        Parameters
+        ----------
+        t : array_like, any shape
+            Times, s.
+
+        Returns
+        -------
+        q, qd : arrays of shape t.shape + (nq,), for a batch (batch,) + t.shape + (nq,)
+            nan at times after the end of an instance.
+
+        Raises
+        ------
+        ValueError
+            If a time is outside of the run.
+        """
+        times = self._within(t)
+        unique_times, place = np.unique(times, return_inverse=True)
+        states = self._states(unique_times)[..., place.ravel(), :]
+        q, qd = states.reshape(*states.shape[:-2], *times.shape, self.model.info.nq)
+        return q, qd
+
+    def sol(self, t: ArrayLike) -> Array:
+        """Return the state [q; qd] at times within the run, as `sol` of SciPy's solve_ivp.
+
+        Parameters
+        ----------
+        t : float or (n,) array_like
+            Times, s.
+
+        Returns
+        -------
+        (2 nq,) or (2 nq, n) array, for a batch (batch, 2 nq) or (batch, 2 nq, n)
+            See `__call__`.
+
+        Raises
+        ------
+        ValueError
+            If a time is outside of the run.
+        """
+        x = np.concatenate(self(t), axis=-1)
+        return np.moveaxis(x, -1, -1 - np.ndim(t))
+
+    def _within(self, t: ArrayLike) -> Array:
+        """Check that times lie within the run; return them, s, as an array of the same shape.
+
+        A time that is outside of the run by no more than rounding is set to the start or end.
+        """
+        times = as_numbers(t, "t", np.dtype(float))
+        begin, end = self.t0, float(self.t[-1])
+        slack = 1e-12 * max(abs(begin), abs(end), end - begin)
+        if times.size and not (times.min() >= begin - slack and times.max() <= end + slack):
+            raise ValueError(f"t: the run goes from {begin:g} s to {end:.9g} s")
+        return np.asarray(np.clip(times, begin, end))
+
+    def _states(self, times: Array) -> Array:
+        """Return the states (2, n, nq), for a batch (2, batch, n, nq), at ascending times (n,)."""
+        raise NotImplementedError
+
+    def evaluate(self, function: Callable[..., Any], *, has_inputs: bool = False) -> Array:
+        """Evaluate a function of the state, and of the inputs if it has them, at each row."""
+        raise NotImplementedError
+
+    @property
+    def u(self) -> Array:
+        """Inputs that act at each row, (n, nu), limited to their allowed ranges.
+
+        At each row they are the values of the scene's signals, or the inputs of the step that
+        begins there. The last row has the inputs of the last step. For a batch (batch, n, nu).
+        """
+        return np.asarray(self.model.functions.saturate(self.requested_inputs, self.request.p))
+
+    @property
+    def saturated(self) -> Array:
+        """Array of bool, as `u`: True where an input exceeds its limits, before it is limited."""
+        return np.asarray(np.abs(self.requested_inputs - self.u) > 0)
+
+    @property
+    def requested_inputs(self) -> Array:
+        """The inputs at each row before saturation, (n, nu), for a batch (batch, n, nu)."""
+        if (inputs := self._row_inputs()) is None:
+            return self.evaluate(self.model.functions.signal)
+        values = np.broadcast_to(inputs, (*self.q.shape[:-1], self.model.info.nu)).copy()
+        if self.q.ndim == 3:
+            values[np.isnan(self.q[..., 0])] = np.nan
+        return values
+
+    def _row_inputs(self) -> Array | None:
+        """Return the inputs before saturation in a shape that fits the rows; None: the signals."""
+        request = self.request
+        u = request.u if self.period_inputs is None else self.period_inputs
+        if u is None or u.ndim == 1 or (u.ndim == 3 and u.shape[-2] == 1):
+            return None if u is None else np.asarray(u)
+        if isinstance(request.u, str) and request.u == saved.NOT_STORED:
+            return np.asarray(u)  # values at the rows alone
+        if not u.shape[-2]:  # no step, and so no inputs
+            return np.full((self.q.shape[-2], u.shape[-1]), np.nan, u.dtype)
+        if not request.has_equal_steps:
+            starts = period_starts(request, u.shape[-2], self.t.dtype)
+            index = np.maximum(np.searchsorted(starts, self.t, side="right") - 1, 0)
+            return np.asarray(u[..., index, :])
+        if self.times is None:
+            index = np.minimum(np.arange(self.q.shape[-2]) * request.every, self._last_step)
+        else:
+            index = split_times(self.times, request.t0, request.h, request.steps)[0]
+        return np.asarray(u[..., np.minimum(index // request.hold, u.shape[-2] - 1), :])
+
+    @cached_property
+    def energy(self) -> Array:
+        """Energy K + P (kinetic and potential) at each row, (n,) or (batch, n), J.
+
+        In a rotating frame, `jacobi` is conserved instead of the energy.
+        """
+        return self.evaluate(self.model.functions.energy)
+
+    @property
+    def jacobi(self) -> Array:
+        """Jacobi's integral qd . dK/dqd - K + P at each row, (n,) or (batch, n), J.
+
+        It equals the energy if K is purely quadratic in qd. Otherwise, as in a rotating frame, it
+        is conserved instead of the energy if the power is zero.
+        """
+        return self.evaluate(self.model.functions.jacobi)
+
+    @cached_property
+    def outputs(self) -> dict[str, Array]:
+        """The scene's outputs at the rows, as a dict from name to array (n,) or (batch, n).
+
+        A value is nan where the output depends on accelerations and the mass matrix D is singular.
+        """
+        names, function = self.model.info.outputs, self.model.functions.output
+        return self._named_values("outputs", names, function)
+
+    @property
+    def constraints(self) -> Mapping[str, Array]:
+        """Residual of each constraint equation as a dict from name to array (n,) or (batch, n).
+
+        A residual is 0 if the equation is satisfied; its unit is that of the equation. Raises
+        KeyError for unknown names.
+        """
+        names, function = self.model.info.constraints.names, self.model.constraints.constraints
+        return self._named_values("constraints", names, function, has_inputs=False)
+
+    @property
+    def multipliers(self) -> Mapping[str, Array]:
+        """Lagrange multiplier of each constraint as a dict from name to array (n,) or (batch, n).
+
+        It is nan where the multiplier does not exist. Raises KeyError for unknown names.
+        """
+        names = self.model.info.constraints.names
+        return self._named_values("multipliers", names, self.model.constraints.multipliers_or_nan)
+
+    @property
+    def reactions(self) -> Mapping[str, Array]:
+        """Reaction of each loop's joint on its second body, by the loop's name.
+
+        A loop is a [[loop]] of the scene: a joint that closes a kinematic chain. Its reaction is
+        the force, N, and the moment about the joint's point, N m, along the axes of the world, at
+        all rows: an array (n, 6) or (batch, n, 6). In plane scenes it has three components: two of
+        the force and the moment.
+        """
+        loops, function = self.model.info.constraints.loops, self.model.constraints.reactions_or_nan
+        return self._named_values("reactions", loops, function, axis=-2)
+
+    def _named_values(
+        self, what: str, names: Sequence[str], function: Callable[..., Any], *,
+        has_inputs: bool = True, axis: int = -1,
+    ) -> dict[str, Array]:  # fmt: skip
+        """Evaluate a function at the rows; return its values along an axis by name."""
+        if not names:
+            return ByName(what, (), ())
+        values = np.moveaxis(self.evaluate(function, has_inputs=has_inputs), axis, 0)
+        return ByName(what, names, np.ascontiguousarray(values))
+
+    def __copy__(self) -> Self:
+        return self.restore(saved.field_values(self))
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        return self.restore(saved.deep_copies(self, memo))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        kind, state = type(self), saved.pickled_values(self)
+        return reduced(f"{kind.__module__.rpartition('.')[2]}.{kind.__name__}.restore", state)
+
+    @classmethod
+    def restore(cls, values: Mapping[str, Any]) -> Self:
+        """Create a run from the values of its fields; the model is that of the build by default."""
+        run = cls.__new__(cls)
+        run.__dict__.update(saved.completed(values))
+        return run
+
+    def __eq__(self, other: object) -> bool:
+        if type(other) is not type(self):
+            return NotImplemented
+        return saved.are_equal(self, other)
+
+    @property
+    def column_names(self) -> tuple[str, ...]:
+        """Names of the columns, in the order of `to_dict`."""
+        return tuple(self._columns())
 
     def _columns(self) -> dict[str, Callable[[], Array]]:
         """Return a function for each column that computes it, by name in the order of `to_dict`."""
@@ -52,20 +375,14 @@ class Columns:
         model = self.model
         rates = [f"{name}_dot" for name in model.info.coordinates]
         halves = (("q", model.info.coordinates), ("qd", rates), ("u", model.info.inputs))
-        columns: dict[str, Callable[[], Array]] = {
-            name: partial(self._column, half, k)
-            for half, names in halves
-            for k, name in enumerate(names)
-        }
-        return columns | {name: partial(self._output, name) for name in model.info.outputs}
 
-    def _output(self, name: str) -> Array:
-        values: Array = self.outputs[name]
-        return values
+        def column(half: str, k: Any) -> Array:
+            values = getattr(self, half)
+            return np.asarray(values[k] if half == "outputs" else values[..., k])
 
-    def _column(self, half: str, k: int) -> Array:
-        column: Array = getattr(self, half)[..., k]
-        return column
+        keys = [(name, half, k) for half, names in halves for k, name in enumerate(names)]
+        keys += [(name, "outputs", name) for name in model.info.outputs]
+        return {name: partial(column, half, k) for name, half, k in keys}
 
     def __getitem__(self, name: str) -> Array:
         if not isinstance(name, str):
@@ -77,6 +394,10 @@ class Columns:
 
     def __getattr__(self, name: str) -> Any:
         """Return the column of that name from the scene, unless a member has the same name."""
+        if name == "request" and "origin" in self.__dict__:
+            choice, *values = self.origin
+            request = self.request = choice.short_request(self.model.info, *values)
+            return request
         named = {} if name.startswith("_") or "model" not in self.__dict__ else self._named()
         if name not in named:
             known = tuple(named)
@@ -93,7 +414,7 @@ class Columns:
         For a batch, the values are arrays (batch,). The dict has the form of the argument `params`
         of `simulate` and `simulate_batch`.
         """
-        names, table = self.model.info.parameters, self.parameter_values
+        names, table = self.model.info.parameters, self.request.p
         if table.ndim == 1:
             return dict(zip(names, table.tolist(), strict=True))
         columns = np.broadcast_to(table, (len(self), len(names))).T.copy()
@@ -130,9 +451,7 @@ class Columns:
         if path.suffix == ".csv" and self._axes == ("t",):
             self._to_csv(path)
         elif path.suffix == ".npz":
-            from .saved import write
-
-            write(self, path)
+            saved.write(self, path)
         else:
             names = ".npz or .csv" if self._axes == ("t",) else ".npz"
             raise ValueError(f"save: {file}: give a name that ends in {names}")
@@ -184,7 +503,7 @@ class Columns:
 
     def _swept(self, units: dict[str, str], taken: set[str]) -> dict[str, Any]:
         """Return the parameters that differ between instances by name (params_NAME if taken)."""
-        if self.parameter_values.ndim == 1 or len(self.parameter_values) == 1:
+        if self.request.p.ndim == 1 or len(self.request.p) == 1:
             return {}
         return {
             f"params_{name}" if name in taken else name: (

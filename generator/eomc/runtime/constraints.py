@@ -7,18 +7,17 @@ is the number of constraint equations; results are in their order in the scene.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arguments import Array, ByName, Parameters, StateArguments, not_one_of
+from . import rank
+from .arguments import Array, ByName, Parameters, StateArguments, as_names
 from .functions import Functions
 from .package import Component, option
-from .status import STATUS, STATUS_MESSAGES, MotionError, state_text
-
-REST_TOLERANCE, MIN_SPEED = 1e-12, 1e-18  # of the largest velocity; m/s or rad/s
+from .status import STATUS, STATUS_MESSAGES, MotionError, check_finite, state_text
 
 
 class Constraints(Component):
@@ -55,7 +54,7 @@ class Constraints(Component):
             phi(q, t) of holonomic and psi(q, qd, t) of nonholonomic constraints, in the units of
             the constraint equations.
         """
-        return self._of_rows("constraints", q, qd, t, params)
+        return np.asarray(self.functions.evaluate("constraints", q, qd, t, None, params))
 
     def constraint_rates(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None
@@ -77,11 +76,7 @@ class Constraints(Component):
             The time derivative A qd + dphi/dt of holonomic constraints, and psi(q, qd, t) of
             nonholonomic ones.
         """
-        return self._of_rows("constraint_rates", q, qd, t, params)
-
-    def _of_rows(self, name: str, q: ArrayLike, qd: ArrayLike, t: float, params: Any) -> Array:
-        values: Array = self.functions.evaluate(name, q, qd, t, None, params)
-        return values
+        return np.asarray(self.functions.evaluate("constraint_rates", q, qd, t, None, params))
 
     def constraint_jacobian(self, q: ArrayLike, t: float = 0.0, params: Parameters = None) -> Array:
         """Return the constraint Jacobian A at positions q.
@@ -101,8 +96,8 @@ class Constraints(Component):
             dphi/dq of holonomic constraints phi(q, t) = 0, dpsi/dqd of nonholonomic ones,
             psi(q, qd, t) = 0.
         """
-        jacobian: Array = self.functions.evaluate("constraint_jacobian", q, None, t, None, params)
-        return jacobian
+        jacobian = self.functions.evaluate("constraint_jacobian", q, None, t, None, params)
+        return np.asarray(jacobian)
 
     def tangent(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None
@@ -143,13 +138,9 @@ class Constraints(Component):
         slopes = self.functions.evaluate("constraint_slopes", q, qd, t, None, params)
         of_q = A[..., : self.info.constraints.holonomic, :]
         whole = np.block([[of_q, np.zeros_like(of_q)], [slopes, A]])
-        if not np.isfinite(whole).all():
-            k = tuple(np.argwhere(~np.isfinite(whole))[0, : whole.ndim - 2])
-            where = state_text(*(np.asarray(x)[k] for x in (q, qd)))
-            raise MotionError(f"at {where}: a constraint's slope is not finite there", "not finite")
-        whole /= np.maximum(np.linalg.norm(whole, axis=-1, keepdims=True), 1e-300)
-        _, sizes, rows = np.linalg.svd(whole)
-        ranks = (sizes > 1e-9 * sizes[..., :1]).sum(axis=-1)
+        check_finite(whole, 2, q, qd, "a constraint's slope")
+        _, sizes, rows = np.linalg.svd(rank.unit_rows(whole))
+        ranks = rank.count(sizes, self.info.dtype)
         if not ranks.size:
             return np.empty((0, 2 * self.nq, 0))
         if np.any(ranks != ranks.flat[0]):
@@ -189,18 +180,15 @@ class Constraints(Component):
         values = self.multipliers_or_nan(q, qd, t, u, params)
         if not np.isfinite(values).all():
             self.functions.acceleration(q, qd, t, u, params)  # raises with place and reason
-            at, k = np.argwhere(~np.isfinite(np.atleast_2d(values)))[0]
-            where = state_text(*(np.atleast_2d(x)[at] for x in (q, qd)))
-            words = f"the multiplier of {self.info.constraints.names[k]} is not finite there"
-            raise MotionError(f"at {where}: {words}", "not finite")
+            k = np.argwhere(~np.isfinite(values))[0, -1]
+            check_finite(values, 1, q, qd, f"the multiplier of {self.info.constraints.names[k]}")
         return values
 
     def multipliers_or_nan(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
     ) -> Array:
         """Return the multipliers, nan if they do not exist."""
-        values: Array = self.functions.evaluate("multipliers", q, qd, t, u, params)
-        return values
+        return np.asarray(self.functions.evaluate("multipliers", q, qd, t, u, params))
 
     def reactions(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
@@ -247,8 +235,7 @@ class Constraints(Component):
         self, multipliers: Array, q: ArrayLike, qd: ArrayLike, t: float, params: Any
     ) -> Array:
         each = np.ascontiguousarray(multipliers)
-        values: Array = self.functions.evaluate("reactions", q, qd, t, None, params, None, each)
-        return values
+        return np.asarray(self.functions.evaluate("reactions", q, qd, t, each, params))
 
     def project(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None,
@@ -281,39 +268,34 @@ class Constraints(Component):
         MotionError
             If no such state is found near the given one (status "locked").
         """
-        if isinstance(fixed, str):
-            fixed = (fixed,)
-        if not (fixed is None or isinstance(fixed, Iterable)):
-            raise ValueError(f"fixed: {fixed!r} is no list of names: {', '.join(self.info.states)}")
-        fixed = fixed and tuple(fixed)
-        for name in fixed or ():
-            if name not in self.info.states:
-                raise ValueError(not_one_of("fixed", name, self.info.states))
-        flags = tuple(name in fixed for name in self.info.states) if fixed else ()
+        names = () if fixed is None else as_names("fixed", fixed, self.info.states)
+        flags = tuple(name in names for name in self.info.states) if names else ()
         return self.project_fixed(q, qd, t, params, flags)
 
     def project_fixed(
         self, q: ArrayLike, qd: ArrayLike, t: float, params: Any, fixed: Sequence[bool]
     ) -> tuple[Array, Array]:
         """Project a state or many. fixed: whether each of q and qd is fixed, or empty."""
-        at, moving, codes = self.project_rows(q, qd, t, params, fixed)
-        if codes.any():
-            k = int(codes.nonzero()[0][0])
-            status = STATUS[codes[k]]
-            where = state_text(at.reshape(-1, self.nq)[k], moving.reshape(-1, self.nq)[k])
-            fixed_names = [n for n, h in zip(self.info.states, fixed, strict=False) if h]
-            fixed_names = [
-                n
-                for n in fixed_names
-                if n.removesuffix("_dot") not in self.info.discrete_coordinates
-            ]
-            what = STATUS_MESSAGES[status] if status != "locked" else (
-                "no state near that obeys the constraints"
-                + (f" with {', '.join(fixed_names)} as given: leave one free" if fixed_names
-                   else "")
-            )  # fmt: skip
-            raise MotionError(f"from {where}: {what}", status)
-        return at, moving
+        return self._check(*self.project_rows(q, qd, t, params, fixed), fixed)
+
+    def _check(
+        self, q: Array, qd: Array, codes: Array, fixed: Sequence[bool]
+    ) -> tuple[Array, Array]:
+        """Return projected states; raise MotionError for the first with a status other than ok."""
+        if not codes.any():
+            return q, qd
+        k = int(codes.nonzero()[0][0])
+        status, discrete = STATUS[codes[k]], self.info.discrete_coordinates
+        names = [
+            name for name, is_fixed in zip(self.info.states, fixed, strict=False)
+            if is_fixed and name.removesuffix("_dot") not in discrete
+        ]  # fmt: skip
+        what = STATUS_MESSAGES[status]
+        if status == "locked":
+            with_fixed = f" with {', '.join(names)} as given: leave one free" if names else ""
+            what = f"no state near that obeys the constraints{with_fixed}"
+        where = state_text(*(np.atleast_2d(x)[k] for x in (q, qd)))
+        raise MotionError(f"from {where}: {what}", status)
 
     def project_rows(
         self, q: ArrayLike, qd: ArrayLike, t: float, params: Any, fixed: Sequence[bool]
@@ -345,12 +327,14 @@ class Constraints(Component):
         """
         if not self.info.constraints.names:
             return q, qd, None
-        q, qd, codes = self._project_starts(q, qd, t0, table if len(table) > 1 else table[0])
+        q, qd, codes = self._assemble(q, qd, t0, table if len(table) > 1 else table[0])
         return q, qd, codes if codes.any() else None
 
     def assemble(self, q0: Any, qd0: Any, t0: float, params: Any) -> tuple[Any, Any]:
         """Return an initial state on the constraints; values that the scene fixes are unchanged."""
         if q0 is None and qd0 is None and params is None and t0 == 0:
+            return q0, qd0
+        if not (self.info.constraints.names or self.info.discrete_count):
             return q0, qd0
         q0, qd0 = self.info.with_discrete(q0, 0), self.info.with_discrete(qd0, 1)
         for x, name in ((q0, "q0"), (qd0, "qd0")):
@@ -359,39 +343,24 @@ class Constraints(Component):
         if not self.info.constraints.names:
             return q0, qd0
         q, qd = self.info.initial_state
-        return self._project_start(q if q0 is None else q0, qd if qd0 is None else qd0, t0, params)
+        states = self._assemble(q if q0 is None else q0, qd if qd0 is None else qd0, t0, params)
+        return self._check(*states, self.info.constraints.fixed)
 
-    def _project_start(
+    def _assemble(
         self, q: ArrayLike, qd: ArrayLike, t0: float, params: Any
-    ) -> tuple[Array, Array]:
-        """Project a start onto the constraints and set friction modes from its velocities."""
-        fixed = self.info.constraints.fixed
-        if not self.info.constraints.modes or not np.shape(q)[-1:] == np.shape(qd)[-1:] == (
-            self.nq,
-        ):
-            return self.project_fixed(q, qd, t0, params, fixed)
-        q = self._sliding(q)
-        return self.project_fixed(
-            *self._in_modes(*self.project_fixed(q, qd, t0, params, fixed)), t0, params, fixed
-        )
-
-    def _project_starts(
-        self, q: Array, qd: Array, t0: float, params: Any
     ) -> tuple[Array, Array, Array]:
-        """Project many starts; return their status too. Failed ones are unchanged."""
+        """Project starts onto the constraints and set friction modes from their velocities.
+
+        Return the status of each as well. Failed ones are unchanged.
+        """
         fixed = self.info.constraints.fixed
         if not self.info.constraints.modes:
             return self.project_rows(q, qd, t0, params, fixed)
-        projected_q, projected_qd, first = self.project_rows(
-            self._sliding(q), qd, t0, params, fixed
-        )
-        projected_q, projected_qd = self._in_modes(projected_q, projected_qd)
-        projected_q, projected_qd, codes = self.project_rows(
-            projected_q, projected_qd, t0, params, fixed
-        )
+        *states, first = self.project_rows(self._sliding(q), qd, t0, params, fixed)
+        *states, codes = self.project_rows(*self._in_modes(*states), t0, params, fixed)
         codes = np.where(first, first, codes)
-        failed = (codes != 0)[:, None]
-        return np.where(failed, q, projected_q), np.where(failed, qd, projected_qd), codes
+        failed = (codes != 0).reshape(*np.shape(q)[:-1], 1)
+        return np.where(failed, q, states[0]), np.where(failed, qd, states[1]), codes
 
     def _sliding(self, q: ArrayLike) -> Array:
         """Return q with all friction modes set to sliding."""
@@ -401,8 +370,9 @@ class Constraints(Component):
 
     def _in_modes(self, q: Array, qd: Array) -> tuple[Array, Array]:
         """Set friction modes to the signs of their velocities; tiny velocities become 0."""
+        rest_tolerance, min_speed = 1e-12, 1e-18  # of the largest velocity; m/s or rad/s
         at, of = np.array(self.info.constraints.modes).T
         fastest = np.max(np.abs(qd), axis=-1, keepdims=True)
-        qd[..., of] *= np.abs(qd[..., of]) > np.maximum(REST_TOLERANCE * fastest, MIN_SPEED)
+        qd[..., of] *= np.abs(qd[..., of]) > np.maximum(rest_tolerance * fastest, min_speed)
         q[..., at] = np.sign(qd[..., of])
         return q, qd

@@ -13,7 +13,7 @@ from .interfaces import CompiledModel
 from .package import reduced
 
 # capacity of the buffers, in addition to one event of each kind: of a run, of each of a batch
-_EVENTS, _EVENTS_EACH = 1024, 64
+_EVENTS, EVENTS_EACH = 1024, 64
 
 
 @dataclass(frozen=True, repr=False)
@@ -74,9 +74,10 @@ class BatchEventLog(EventLog):
         try:
             at = index(k)
         except TypeError:
-            raise TypeError(f"of: {k!r} is no number of an instance") from None
+            raise TypeError(f"for_instance: {k!r} is not the index of an instance") from None
         if not -self._batch <= at < self._batch:
-            raise IndexError(f"of: there is no instance {at}: they are 0 to {self._batch - 1}")
+            last = self._batch - 1
+            raise IndexError(f"for_instance: there is no instance {at}: they are 0 to {last}")
         own = self.instance == at % self._batch
         return EventLog(self.t[own], self.q[own], self.qd[own])
 
@@ -94,18 +95,19 @@ class BatchEventBuffer:
 
     def __init__(self, model: CompiledModel, most: float) -> None:
         self.model, self.most, self.count = model, most, 0
-        self.pieces = list[tuple[Array, Array, Array]]()
+        self.pieces: list[tuple[Array, Array, Array]] = []
 
     def room(self, count: int) -> GroupEventBuffer:
         """Return a new, empty buffer for one call of C, which simulates `count` instances."""
         return GroupEventBuffer(self.model, count)
 
-    def keep(self, room: GroupEventBuffer, first: int) -> None:
+    def keep(self, room: GroupEventBuffer, counts: Array, first: int) -> None:
         """Copy the events that a call of C wrote into its buffer.
 
-        room: the buffer. first: index in the batch of the first instance of that call.
+        room: the buffer. counts: number of events of each instance. first: index in the batch of
+        the first instance of that call.
         """
-        some = np.arange(room.which.shape[1]) < room.counts[:, None]
+        some = np.arange(room.which.shape[1]) < counts[:, None]
         if some.any():
             self.pieces.append((some.nonzero()[0] + first, room.which[some], room.rows[some]))
             self.count += int(some.sum())
@@ -133,26 +135,20 @@ class GroupEventBuffer:
 
     Attributes
     ----------
-    counts : (count,) array
-        Number of events of each instance.
     which : (count, capacity) array
         Index of each event in `events` of the model.
     rows : (count, capacity, 1 + 2 nq) array
         Time and state [t, q, qd] of each event.
     c_arguments : tuple
-        The arguments of the C function: the capacity, and pointers to these three arrays.
+        The arguments of the C function: the capacity, and pointers to these two arrays.
     """
 
     def __init__(self, model: CompiledModel, count: int) -> None:
-        self.counts = np.zeros(count, "l")
-        each = _EVENTS_EACH + len(model.info.events)
+        each = EVENTS_EACH + len(model.info.events)
         self.which = np.empty((count, each), np.intc)
         self.rows = np.empty((count, each, 1 + 2 * model.info.nq), model.info.dtype)
-        new = model.c.ffi.from_buffer
-        self.c_arguments = (
-            each, new("long[]", self.counts), new("int[]", self.which),
-            model.c.pointer(self.rows),
-        )  # fmt: skip
+        which = model.c.ffi.from_buffer("int[]", self.which)
+        self.c_arguments = each, which, model.c.pointer(self.rows)
 
 
 class EventBuffer:
@@ -162,7 +158,8 @@ class EventBuffer:
     """
 
     def __init__(self, model: CompiledModel) -> None:
-        self.model, self.pieces = model, list[tuple[Array, Array]]()
+        self.model = model
+        self.pieces: list[tuple[Array, Array]] = []
         self.which = np.empty(_EVENTS + len(model.info.events), np.intc)
         self.rows = np.empty((len(self.which), 1 + 2 * model.info.nq), model.info.dtype)
 

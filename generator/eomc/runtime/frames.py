@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arguments import Array, Parameters, not_one_of
-from .functions import Functions
+from .arguments import Array, Parameters, index_of
+from .functions import FUNCTIONS, Functions
 from .package import Component, option, reduced
 
 
@@ -102,7 +102,7 @@ class Frames(Component):
         ValueError
             If `frame` is not among the scene's `frames`.
         """
-        poses = self._evaluate_frame("frame_poses", 1, frame, q, None, t, params)
+        poses = self._evaluate_frame("frame_poses", frame, q, None, t, params)
         if self.info.plane:
             return Pose(poses[..., :2], poses[..., 2])
         return Pose(poses[..., :3], poses[..., 3:].reshape(*poses.shape[:-1], 3, 3))
@@ -127,7 +127,7 @@ class Frames(Component):
         (6,) array, in plane scenes (3,)
             m/s and rad/s; with a leading axis n for n states.
         """
-        return self._evaluate_frame("frame_velocities", 1, frame, q, qd, t, params)
+        return self._evaluate_frame("frame_velocities", frame, q, qd, t, params)
 
     def frame_acceleration(
         self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike | None = None, frame: str | None = None,
@@ -153,7 +153,7 @@ class Frames(Component):
         """
         each = np.zeros(np.shape(q), self.info.dtype) if qdd is None else qdd
         full = self.arguments.for_each_state(each, "qdd", (self.info.nq,), q)
-        return self._evaluate_frame("frame_accelerations", 1, frame, q, qd, t, params, full)
+        return self._evaluate_frame("frame_accelerations", frame, q, qd, t, params, full)
 
     def jacobian(
         self, q: ArrayLike, frame: str | None = None, t: float = 0.0, params: Parameters = None
@@ -174,7 +174,7 @@ class Frames(Component):
         (6, nq) array, in plane scenes (3, nq)
             With a leading axis n for n states.
         """
-        return self._evaluate_frame("frame_jacobians", 2, frame, q, None, t, params)
+        return self._evaluate_frame("frame_jacobians", frame, q, None, t, params)
 
     def frame_forces(
         self, q: ArrayLike, wrenches: Mapping[str, ArrayLike] | ArrayLike, t: float = 0.0,
@@ -199,7 +199,7 @@ class Frames(Component):
             Generalized forces, N or N m.
         """
         forces: Array = self.functions.evaluate(
-            "frame_forces", q, None, t, None, params, None, self._wrenches(wrenches, q)
+            "frame_forces", q, None, t, self._wrenches(wrenches, q), params
         )
         return forces
 
@@ -237,9 +237,7 @@ class Frames(Component):
         if f_ext is not None and not self.info.frames:
             raise ValueError(f"f_ext acts at frames: build it with {option('frames')}")
         accelerations = self.arguments.for_each_state(qdd, "qdd", (self.info.nq,), q)
-        forces: Array = self.functions.evaluate(
-            "inverse_dynamics", q, qd, t, None, params, None, accelerations
-        )
+        forces: Array = self.functions.evaluate("inverse_dynamics", q, qd, t, accelerations, params)
         return forces if f_ext is None else forces - self.frame_forces(q, f_ext, t=t, params=params)
 
     def momentum(
@@ -265,17 +263,14 @@ class Frames(Component):
         return Momentum(x[..., 0], x[..., 1 : 1 + d], x[..., 1 + d : 1 + 2 * d], angular)
 
     def _evaluate_frame(
-        self, name: str, axes: int, frame: str | None, q: ArrayLike, qd: ArrayLike | None, t: float,
-        params: Parameters, extra: Array | None = None,
+        self, name: str, frame: str | None, q: ArrayLike, qd: ArrayLike | None, t: float,
+        params: Parameters, accelerations: Array | None = None,
     ) -> Array:  # fmt: skip
-        """Evaluate a function of all frames; return the part of one, which has `axes` axes."""
-        if not (frame is None or frame in self.info.frames):
-            raise ValueError(not_one_of("frame", frame, self.info.frames))
-        values: Array = self.functions.evaluate(name, q, qd, t, None, params, None, extra)
-        if frame is None:
-            return values
-        one: Array = values.take(self.info.frames.index(frame), axis=values.ndim - 1 - axes)
-        return one
+        """Evaluate a function of all frames; return the part of one frame, or all."""
+        place = None if frame is None else index_of("frame", frame, self.info.frames)
+        values: Array = self.functions.evaluate(name, q, qd, t, accelerations, params)
+        axis = -len(FUNCTIONS[name].shape(self.info))
+        return values if place is None else np.asarray(values.take(place, axis=axis))
 
     def _wrenches(self, wrenches: Mapping[str, ArrayLike] | ArrayLike, q: ArrayLike) -> Array:
         shape = (len(self.info.frames), self.info.frame_size)
@@ -283,9 +278,7 @@ class Frames(Component):
             return self.arguments.for_each_state(wrenches, "wrenches", shape, q)
         each = np.zeros((*np.shape(q)[:-1], *shape), self.info.dtype)
         for name, wrench in wrenches.items():
-            if name not in self.info.frames:
-                raise ValueError(not_one_of("wrenches", name, self.info.frames))
-            place = self.info.frames.index(name)
+            place = index_of("wrenches", name, self.info.frames)
             each[..., place, :] = self.arguments.for_each_state(
                 wrench, f"wrenches: {name}", shape[1:], q
             )

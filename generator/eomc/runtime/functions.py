@@ -15,12 +15,11 @@ from numpy import empty
 from numpy.typing import ArrayLike
 
 from .arguments import Arguments, Array, Parameters, StateArguments, as_flag, as_number
-from .c_library import slices
-from .info import SceneInfo
+from .info import SceneInfo, slices
 from .package import Component, named_outputs, option
-from .status import STATUS, STATUS_MESSAGES, MotionError, state_text
+from .status import STATUS, check_finite, refuse
 
-_ROWS = 20_000  # rows times coordinates squared in one call of C, some ms at most
+ROWS_PER_CALL = 20_000  # rows times coordinates squared in one call of C, some ms at most
 
 
 class StateFunction(NamedTuple):
@@ -32,10 +31,13 @@ class StateFunction(NamedTuple):
         Function that takes the `SceneInfo` and returns the shape of the result at one state.
     of_velocity : bool
         Whether the generated C function takes the velocities qd as well as q.
+    of_inputs : bool
+        Whether it takes inputs; otherwise other numbers take their place, as accelerations.
     """
 
     shape: Callable[[SceneInfo], tuple[int, ...]]
     of_velocity: bool = True
+    of_inputs: bool = True
 
 
 FUNCTIONS: Mapping[str, StateFunction] = {
@@ -60,12 +62,12 @@ FUNCTIONS: Mapping[str, StateFunction] = {
         lambda m: (len(m.frames), 3 if m.plane else 12), of_velocity=False
     ),
     "frame_velocities": StateFunction(lambda m: (len(m.frames), m.frame_size)),
-    "frame_accelerations": StateFunction(lambda m: (len(m.frames), m.frame_size)),
+    "frame_accelerations": StateFunction(lambda m: (len(m.frames), m.frame_size), of_inputs=False),
     "frame_jacobians": StateFunction(
         lambda m: (len(m.frames), m.frame_size, m.nq), of_velocity=False
     ),
-    "frame_forces": StateFunction(lambda m: (m.nq,), of_velocity=False),
-    "inverse_dynamics": StateFunction(lambda m: (m.nq,)),
+    "frame_forces": StateFunction(lambda m: (m.nq,), of_velocity=False, of_inputs=False),
+    "inverse_dynamics": StateFunction(lambda m: (m.nq,), of_inputs=False),
     "momentum": StateFunction(lambda m: (6 if m.plane else 10,)),
     "constraints": StateFunction(lambda m: (len(m.constraints.names),)),
     "constraint_rates": StateFunction(lambda m: (len(m.constraints.names),)),
@@ -74,7 +76,7 @@ FUNCTIONS: Mapping[str, StateFunction] = {
     ),
     "constraint_slopes": StateFunction(lambda m: (len(m.constraints.names), m.nq)),
     "multipliers": StateFunction(lambda m: (len(m.constraints.names),)),
-    "reactions": StateFunction(lambda m: (len(m.constraints.loops), m.frame_size)),
+    "reactions": StateFunction(lambda m: (len(m.constraints.loops), m.frame_size), of_inputs=False),
     "events": StateFunction(lambda m: (len(m.events),)),
     "jumps": StateFunction(lambda m: (len(m.events), 2 * m.nq)),
 }
@@ -97,22 +99,22 @@ class Functions(Component):
     def __init__(self, arguments: Arguments) -> None:
         self.arguments, self.info, self.c = arguments, arguments.info, arguments.c
         self.nq, self.dtype = self.info.nq, self.info.dtype
-        self._bound: dict[str, Any] = {}  # by name: C function, shape, whether it reads qd
+        self.c_functions: dict[str, Any] = {}  # by name: C function, row of FUNCTIONS
 
     def evaluate(
         self, name: str, q: ArrayLike, qd: ArrayLike | None, t: Any = 0.0, u: Any = None,
-        params: Any = None, out: Any = None, extra: Array | None = None,
+        params: Any = None, out: Any = None,
     ) -> Any:  # fmt: skip
         """Evaluate a function of FUNCTIONS at one state, or at many in one call of C.
 
-        extra: the argument in place of u of some functions, one for all states or one each.
+        u: inputs, or an array of the numbers in their place, one for all states or one each.
         """
         address, real, null = self.c.tools
-        if (bound := self._bound.get(name)) is None:
+        if (bound := self.c_functions.get(name)) is None:
             of = FUNCTIONS[name]
-            bound = getattr(self.c.lib, name, None), of.shape(self.info), of.of_velocity
-            self._bound[name] = bound
-        function, shape, of_velocity = bound
+            bound = getattr(self.c.lib, name, None), of.shape(self.info), *of[1:]
+            self.c_functions[name] = bound
+        function, shape, of_velocity, of_inputs = bound
         at: Any
         if of_velocity:
             from_q, from_qd, at, _ = self.arguments.read_state(q, qd)
@@ -123,10 +125,11 @@ class Functions(Component):
                 from_q = address(real, at)
         rows = at.shape[:-1]
         result = self.arguments.output_array(out, rows + shape)
-        if rows or extra is not None:
-            acts = StateArguments(self.arguments, rows, t, u, params, extra)
+        if rows or not of_inputs:
+            inputs, numbers = (u, None) if of_inputs else (None, u)
+            acts = StateArguments(self.arguments, rows, t, inputs, params, numbers)
             to, size = address(real, result), result[:1].size if rows else 0
-            for k, many in slices(rows[0] if rows else 1, _ROWS // self.nq**2 + 1):
+            for k, many in slices(rows[0] if rows else 1, ROWS_PER_CALL // self.nq**2 + 1):
                 if function is None:
                     break
                 here = self.nq * k
@@ -491,16 +494,11 @@ class Functions(Component):
                 lambda k, many: function(
                     many, to + n * k, from_q + n * k, from_qd + n * k, *acts.pointers(k)
                 ),
-                len(at), _ROWS // n**2 + 1,
+                len(at), ROWS_PER_CALL // n**2 + 1,
             )  # fmt: skip
         if status != "ok":
-            where = state_text(np.atleast_2d(at)[completed], np.atleast_2d(moving)[completed])
-            what = (
-                STATUS_MESSAGES[status]
-                if status == "singular"
-                else "the acceleration is not finite there"
-            )
-            raise MotionError(f"at {where}: {what}", status)
+            what = "" if status == "singular" else "the acceleration is not finite there"
+            refuse(status, at, moving, completed, what)
         if values is not result:
             result[...] = values
         return result
@@ -512,7 +510,7 @@ class Functions(Component):
 
     def linearize(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Any = None, *,
-        outputs: bool = False, closed: bool = False,
+        outputs: bool = False, closed: bool = False, out: tuple[Array, Array] | None = None,
     ) -> tuple[Array, ...]:  # fmt: skip
         """Linearise the motion at a state: d(dx)/dt = A dx + B du for the state x = [q; qd].
 
@@ -534,6 +532,8 @@ class Functions(Component):
         closed : bool
             Let the scene's signals follow the state: A is then the matrix of the closed loop, and B
             belongs to inputs that are added to the signals. Only without `u`.
+        out : (A, B), optional
+            Arrays that receive A and B. Their contents are undefined after an error.
 
         Returns
         -------
@@ -568,7 +568,7 @@ class Functions(Component):
                 f"with {option('linearize')}"
             )
         at, moving = self.arguments.state(q, qd)
-        A, B = self.slopes(at, moving, u, t, params)
+        A, B = self.slopes(at, moving, u, t, params, out)
         both = [(A, B)]
         if outputs:
             n, m = self.nq, self.info.nu
@@ -577,34 +577,29 @@ class Functions(Component):
             both.append((by_state + by_qdd @ A[..., n:, :], by_u + by_qdd @ B[..., n:, :]))
         if closed:
             K = self.feedback(at, moving, u, t, params)
-            both = [(by_state + by_u @ K, by_u) for by_state, by_u in both]
+            for by_state, by_u in both:
+                by_state += by_u @ K
         return tuple(x for pair in both for x in pair)
 
-    def slopes(self, q: Array, qd: Array, u: Any, t: float, params: Any) -> tuple[Array, Array]:
-        """A and B of states (nq,) or (n, nq). Raises MotionError."""
+    def slopes(
+        self, q: Array, qd: Array, u: Any, t: float, params: Any, out: Any = None
+    ) -> tuple[Array, Array]:
+        """Return A and B of states (nq,) or (n, nq). Raises MotionError."""
         n, m, rows = self.nq, self.info.nu, q.shape[:-1]
-        A, B = np.zeros((*rows, 2 * n, 2 * n), self.dtype), np.zeros((*rows, 2 * n, m), self.dtype)
-        A_q, A_qd, B_u = (empty((*rows, n, w), self.dtype) for w in (n, n, m))
-        out = [(self.c.pointer(x), n * w) for x, w in ((A_q, n), (A_qd, n), (B_u, m))]
+        A, B = self.arguments.output_matrices(out, "(A, B)", q, qd)
+        targets = [(self.c.pointer(x), 2 * n * w) for x, w in ((A, 2 * n), (B, m))]
         from_q, from_qd = self.c.pointer(q), self.c.pointer(qd)
         acts = StateArguments(self.arguments, rows, t, u, params)
         completed, status = self._all_rows(
             lambda k, many: self.c.lib.linearization(
-                many, *(to + k * size for to, size in out), from_q + n * k, from_qd + n * k,
+                many, *(to + k * size for to, size in targets), from_q + n * k, from_qd + n * k,
                 *acts.pointers(k),
             ),
-            q.size // n, _ROWS // n**3 + 1,
+            q.size // n, ROWS_PER_CALL // n**3 + 1,
         )  # fmt: skip
         if status != "ok":
-            what = (
-                STATUS_MESSAGES[status]
-                if status == "singular"
-                else "a derivative is not finite there"
-            )
-            where = state_text(*(x.reshape(-1, n)[completed] for x in (q, qd)))
-            raise MotionError(f"at {where}: {what}", status)
-        A[..., :n, n:] = np.eye(n)
-        A[..., n:, :n], A[..., n:, n:], B[..., n:, :] = A_q, A_qd, B_u
+            what = "" if status == "singular" else "a derivative is not finite there"
+            refuse(status, q, qd, completed, what)
         return A, B
 
     def feedback(self, q: Array, qd: Array, u: Any, t: float, params: Any) -> Array:
@@ -657,10 +652,7 @@ class Functions(Component):
                 "parameters, with " + option("linearize", '"parameters"')
             )
         E: Array = self.evaluate("sensitivity", q, qd, t, u, params)
-        if not np.isfinite(E).all():
-            k = np.argwhere(~np.isfinite(E))[0, : E.ndim - 2]
-            where = state_text(*(np.asarray(x)[tuple(k)] for x in (q, qd)))
-            raise MotionError(f"at {where}: a derivative is not finite there", "not finite")
+        check_finite(E, 2, q, qd, "a derivative")
         if not as_flag(outputs, "outputs"):
             return E
         if not self.info.outputs:

@@ -1,9 +1,10 @@
-"""Facts about a compiled scene: names, dimensions, initial values, methods, constraints."""
+"""Facts about a compiled scene (names, dimensions, initial values), and its C functions."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from time import perf_counter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -68,6 +69,11 @@ class MethodInfo(NamedTuple):
     stages: int
     oscillation_limit: float
     decay_limit: float
+
+    @property
+    def is_implicit(self) -> bool:
+        """True for a Gauss method, whose order is larger than the number of stages."""
+        return self.order > self.stages
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -157,29 +163,21 @@ class SceneInfo:
             array.flags.writeable = False
             return array
 
+        names = ("coordinates", "inputs", "parameters", "outputs", "methods", "events", "frames")
+        values: dict[str, Any] = {name: tuple(scene.get(name, ())) for name in names}
+        values |= {name: scene[name] for name in ("name", "title", "digest", "h", "duration")}
         q, qd = scene["start"]
         constraints = ConstraintInfo(*scene.get("constrained", ()))
         return cls(
-            name=scene["name"],
-            title=scene["title"],
-            digest=scene["digest"],
+            **values,
             dtype=dtype,
-            coordinates=tuple(scene["coordinates"]),
-            inputs=tuple(scene["inputs"]),
-            parameters=tuple(scene["parameters"]),
-            outputs=tuple(scene["outputs"]),
             defaults=Defaults(scene["parameters"]),
             units=dict(scene["units"]),
             initial_state=(constant(q), constant(qd)),
             p0=constant(tuple(scene["parameters"].values())),
             start_formulas=scene.get("follows", {}),
-            h=scene["h"],
-            duration=scene["duration"],
-            methods=tuple(scene["methods"]),
             method_table={name: MethodInfo(*x) for name, x in scene["methods"].items()},
             tolerance=scene.get("tolerance"),
-            events=tuple(scene.get("events", ())),
-            frames=tuple(scene.get("frames", ())),
             plane=scene.get("plane", False),
             constraints=constraints,
             discrete_count=len(constraints.modes) + constraints.discrete,
@@ -246,3 +244,56 @@ class SceneInfo:
         step function, which locate events.
         """
         return 2 * steps + self.method_table[method].stages * calls
+
+
+class CLibrary:
+    """The compiled functions of a scene, and what their calls need.
+
+    Attributes
+    ----------
+    ffi, lib
+        The interface of cffi, and the C functions as its attributes.
+    null
+        The null pointer.
+    tools : tuple
+        (address, real, null): address(real, array) is a pointer to the numbers of an array.
+        Unpacking it once is faster than reading attributes.
+    """
+
+    def __init__(self, extension: Any, dtype: np.dtype[Any]) -> None:
+        self.ffi, self.lib = extension.ffi, extension.lib
+        real = self.ffi.typeof({"float64": "double[]", "float32": "float[]"}[dtype.name])
+        self.null = self.ffi.NULL
+        self.tools = (self.ffi.from_buffer, real, self.null)
+
+    def pointer(self, array: NDArray[Any] | None) -> Any:
+        """Return a pointer to the numbers of a C-contiguous array of the module's number type.
+
+        Return the null pointer if `array` is None. The array has to exist as long as C uses it.
+        """
+        address, real, null = self.tools
+        return null if array is None else address(real, array)
+
+
+def next_chunk(count: int, elapsed: float, seconds: float = 0.05) -> int:
+    """Return the number of items that are expected to take `seconds` to process.
+
+    The estimate uses the time per item of the last chunk: `count` items in `elapsed` seconds. The
+    result differs from `count` by at most a factor of 16.
+    """
+    max_growth = 16.0  # the first rows may be the cheap ones
+    return int(count * min(max_growth, max(1 / max_growth, seconds / (elapsed + 1e-9)))) + 1
+
+
+def slices(count: int, first: int) -> Iterator[tuple[int, int]]:
+    """Yield consecutive slices (start, size) of `count` rows, each of which takes some 50 ms.
+
+    The first slice has `first` rows. The size of each further slice follows from the time that the
+    caller spent on the previous one.
+    """
+    start, size = 0, first
+    while start < count:
+        size = min(size, count - start)
+        start_time = perf_counter()
+        yield start, size
+        start, size = start + size, next_chunk(size, perf_counter() - start_time)

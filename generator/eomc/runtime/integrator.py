@@ -1,75 +1,52 @@
-"""Steps and runs of a compiled scene by fixed or adaptive steps; the loops are in C."""
+"""Steps and runs of a compiled scene, and the stability limit of steps; the loops are in C."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from math import isfinite
-from time import perf_counter
-from typing import Any, NamedTuple, Never, cast
+from contextlib import suppress
+from math import inf, sqrt
+from typing import Any, Never, cast
 
 import numpy as np
 from numpy import empty
 from numpy.typing import ArrayLike
 
-from . import adaptive, output_times
+from . import rank
 from .arguments import (
     Array,
     Parameters,
     Start,
     StateArguments,
-    as_count,
     as_flag,
     as_number,
     as_period,
     as_step_size,
-    machine_memory,
 )
-from .c_library import next_chunk, slices
-from .inputs import FeedbackLaw, SampledSignal, warn_called_each_step
+from .info import slices
+from .integration import integrate, run_at_once
 from .interfaces import CompiledModel
 from .package import Component, option, warn, with_events
 from .requests import (
+    ADAPTIVE_METHOD,
     FIRST_CALL_NUMBERS,
-    MAX_EVERY,
-    FixedStepRequest,
+    MAX_SHORT_STEPS,
+    MIN_CHECKED_STEPS,
     Inputs,
+    PlainSteps,
+    Progress,
+    Request,
     SimulationArguments,
+    StepChoice,
     as_progress,
-    step_count,
+    checked_inputs,
+    initial_state_for_parameters,
+    named_initial_state,
 )
-from .stability import MIN_STEPS, LinearizationState, advice
-from .starts import initial_state_for_parameters, is_by_name
 from .status import STATUS, STATUS_MESSAGES, Interrupted, MotionError, state_text
-from .trajectory import Run
+from .trajectory import Trajectory
 
+_State = tuple[Array, Array, float, Any, Any]  # q, qd, t, u, params
 _STEPS = 20_000  # steps times coordinates cubed in one call of C, some ms at most
-_MAX_SHORT_STEPS = 999  # of a run in a single call of C
-MIN_CHECKED_NUMBERS = 2**24  # positions; larger runs are checked against the memory
-
-
-class Loop(NamedTuple):
-    """C functions of an integration method.
-
-    Attributes
-    ----------
-    step, run : C functions
-        A step, and a run of steps.
-    short : int
-        Largest number of steps of a run that needs no workspace and no check of Ctrl-C; -1: none.
-    stages : int
-        Number of evaluations of the accelerations in a step of an explicit method.
-    work_type : C type
-        Type of a pointer to the workspace of a run.
-    evaluations : C function or None
-        Returns the number of evaluations in a run; None if it is stages times steps.
-    """
-
-    step: Any
-    run: Any
-    short: int
-    stages: int
-    work_type: Any
-    evaluations: Any
 
 
 class Integrator(Component):
@@ -77,13 +54,31 @@ class Integrator(Component):
 
     Attributes
     ----------
-    loops : dict of Loop
-        C functions of each method, by name.
+    step_functions : dict
+        C functions that make a step of a method, by its name.
+    short_methods : dict
+        For each method the largest number of fixed steps of a run that needs no workspace and no
+        check of Ctrl-C, the number of the method in C, and the number of evaluations in a step (0:
+        not constant).
+    plain_steps : PlainSteps
+        Checked steps by the arguments of calls.
+    spare_counts : list
+        Memory for the counts of a short run, for which no run has use.
+    start_bytes : bytes
+        Numbers of the scene's initial state, q and then qd.
+    input_shape : tuple
+        Shape of constant inputs.
+    no_events : tuple
+        Arguments of C in place of a buffer for events; () for a scene without events.
     warned : set
         Warnings that have been issued: pairs (method, step size) beyond the stability limit, and
         "u" for a Python function as input.
     room : int
         Number of rows that suffices for a short adaptive run; 0 if the last run was long.
+    has_plain_runs : bool
+        Whether the scene has neither constraints nor discrete coordinates.
+    has_short_runs : bool
+        Whether the scene has no events either, as runs by a single call of C require.
     ignores_events : bool
         True to simulate with fixed steps as if the scene had no events, as checks need.
     """
@@ -92,23 +87,24 @@ class Integrator(Component):
 
     def __init__(self, model: CompiledModel) -> None:
         self.model, self.info, self.c, self.arguments = model, model.info, model.c, model.arguments
-        self.loops = {name: self._loop(name) for name in self.info.methods}
+        info, null = self.info, self.c.null
+        self.step_functions = {x: getattr(self.c.lib, f"{x}_step") for x in info.methods}
+        self.short_methods = {ADAPTIVE_METHOD: (0, 0, 0)}
+        for number, name in enumerate(info.methods):
+            method = info.method_table[name]
+            most = FIRST_CALL_NUMBERS // info.nq ** (3 if method.is_implicit else 1)
+            stages = 0 if method.is_implicit else method.stages
+            self.short_methods[name] = min(MAX_SHORT_STEPS, most), number, stages
+        self.spare_counts: list[Any] = []
+        self.start_bytes = b"".join(x.tobytes() for x in info.initial_state)
+        self.input_shape = (info.nu,)
+        self.no_events: tuple[Any, ...] = (0, null, null) if info.events else ()
+        self.has_plain_runs = not (self.info.constraints.names or self.info.discrete_count)
+        self.has_short_runs = self.has_plain_runs and not info.events
         self.warned: set[Any] = set()
+        self.plain_steps = PlainSteps(info, self.warned)
         self.room = 0
         self.ignores_events = False
-
-    def _loop(self, name: str) -> Loop:
-        lib, info = self.c.lib, self.info
-        evaluations = getattr(lib, f"{name}_evaluations", None)
-        needs_work = evaluations or info.constraints.names or info.events
-        short = -1 if needs_work else min(_MAX_SHORT_STEPS, FIRST_CALL_NUMBERS // info.nq)
-        step, run = (getattr(lib, f"{name}_{what}") for what in ("step", "run"))
-        stages = info.method_table[name].stages
-        return Loop(step, run, short, stages, self.c.ffi.typeof(f"{name}_work *"), evaluations)
-
-    def c_function(self, method: str | None, what: str) -> Any:
-        """Return the C function of a method (None: the first): its step, run or batch."""
-        return getattr(self.c.lib, f"{self.info.method_name(method)}_{what}")
 
     def step(
         self, q: ArrayLike, qd: ArrayLike, h: float | None = None, t: float = 0.0, u: Any = None,
@@ -155,7 +151,7 @@ class Integrator(Component):
         else:
             ends = self.arguments.output_pair(out, at.shape)
             to_q, to_qd = address(real, ends[0]), address(real, ends[1])
-        step = self.loops[self.info.method_name(method)].step
+        step = self.step_functions[self.info.method_name(method)]
         code = step(to_q, to_qd, from_q, from_qd, as_number(t, "t"), h, inputs, p)
         if code:
             status = STATUS[code]
@@ -168,6 +164,7 @@ class Integrator(Component):
     def discretize(
         self, q: ArrayLike, qd: ArrayLike, h: float | None = None, t: float = 0.0, u: Any = None,
         params: Any = None, method: str | None = None, *, control_period: float | None = None,
+        out: tuple[Array, Array] | None = None,
     ) -> tuple[Array, Array]:  # fmt: skip
         """Return the derivatives Phi and Gamma of one step: dx' = Phi dx + Gamma du.
 
@@ -192,8 +189,9 @@ class Integrator(Component):
             Name in `methods`; by default the first.
         control_period : float, optional
             Period, s, of several steps that are differentiated together. The inputs are constant
-            over
-            it: `u`, or the scene's signals at its start.
+            over it: `u`, or the scene's signals at its start.
+        out : (Phi, Gamma), optional
+            Arrays that receive the results. Their contents are undefined after an error.
 
         Returns
         -------
@@ -220,8 +218,7 @@ class Integrator(Component):
                 f"{option('discretize')}"
             )
         rows, n, nu = q.shape[:-1], self.info.nq, self.info.nu
-        Phi = empty((*rows, 2 * n, 2 * n), self.info.dtype)
-        Gamma = empty((*rows, 2 * n, nu), self.info.dtype)
+        Phi, Gamma = self.arguments.output_matrices(out, "(Phi, Gamma)", q, qd)
         K = None
         if hold is not None and u is None and self.info.nu:
             u = self.model.functions.signal(q, qd, t, params)
@@ -242,7 +239,9 @@ class Integrator(Component):
                 completed, step = divmod(code >> 3, steps)
                 _refuse(q.reshape(-1, n)[k + completed], qd.reshape(-1, n)[k + completed],
                         acts.time(k + completed), step, STATUS[code & 7])  # fmt: skip
-        return (Phi if K is None else Phi + Gamma @ K), Gamma
+        if K is not None:
+            Phi += Gamma @ K
+        return Phi, Gamma
 
     def simulate(
         self, q0: Start = None, qd0: Start = None, h: float | None = None,
@@ -252,7 +251,7 @@ class Integrator(Component):
         progress: Callable[[int, int], None] | None = None, estimate: bool = False,
         tol: float | None = None, times: ArrayLike | None = None, max_step: float | None = None,
         stiff: bool = False, events: Mapping[str, Any] | None = None, **unknown: Never,
-    ) -> Run:  # fmt: skip
+    ) -> Trajectory:  # fmt: skip
         """Simulate the motion by fixed steps of size h or by adaptive steps, and return the run.
 
         Steps are adaptive if `tol`, `max_step`, `stiff` or method="auto" is given, or if the scene
@@ -303,8 +302,8 @@ class Integrator(Component):
 
         Returns
         -------
-        Run
-            The trajectory; `run.status` is "ok" if it reached its end.
+        Trajectory
+            The run; `run.status` is "ok" if it reached its end.
 
         Raises
         ------
@@ -319,118 +318,67 @@ class Integrator(Component):
         """
         if events is not None or unknown:
             other, arguments = with_events(self.simulate, dict(locals()))
-            return cast(Run, other.integrator.simulate(**arguments))
-        if (params is not None and self.info.start_formulas) or is_by_name(q0, qd0):
-            p = self.arguments.parameters(params)
-            q0, qd0 = initial_state_for_parameters(self.model, q0, qd0, p)
-        # calls with few arguments take a short path, since a short run takes a few microseconds
-        is_simple = (out is None and progress is None and control_period is None and not estimate
-                     and times is None and type(t0) is float and isfinite(t0))  # fmt: skip
-        if (
-            is_simple and (room := self.room) and h is None and steps is None and method is None
-            and max_step is None and every == 1 and stiff is False
-            and (
-                short := adaptive.simulate_short_run(
-                    self.model, (q0, qd0), duration, u, params, t0, tol, room
-                )
-            ) is not None
-        ):  # fmt: skip
-            return short
-        estimate, progress = as_flag(estimate, "estimate"), as_progress(progress)
-        q0, qd0 = self.model.constraints.assemble(q0, qd0, t0, params)
-        if is_simple and u is duration is tol is max_step is None and stiff is False:
-            run = self._short_run((q0, qd0), h, steps, every, params, method, t0)
+            return cast(Trajectory, other.integrator.simulate(**arguments))
+        choice = None
+        if max_step is control_period is None and out is None and progress is None:
+            key = h, duration, steps, every, method, tol, times is not None
+            choice = self.plain_steps.find(key)
+        is_short = self.has_short_runs and stiff is False and estimate is False
+        if choice is not None and is_short and type(t0) is float:
+            run = run_at_once(self.model, choice, t0, times, (q0, qd0, u, params))
             if run is not None:
                 return run
+        estimate, progress = as_flag(estimate, "estimate"), as_progress(progress)
+        q0, qd0 = named_initial_state(self.model, q0, qd0, params)
+        start = self.model.constraints.assemble(q0, qd0, t0, params)
         options = SimulationArguments(
-            q0, qd0, h, duration, steps, every, u, params, method, t0, control_period, out,
+            *start, h, duration, steps, every, u, params, method, t0, control_period, out,
             progress, tol, times, max_step, stiff,
         )  # fmt: skip
-        if options.uses_adaptive_steps(self.info):
-            return self._finish(adaptive.simulate(self.model, options), estimate)
-        if self.info.events and not self.ignores_events:
-            return self._finish(adaptive.simulate_fixed_steps(self.model, options), estimate)
-        return self._finish(self._fixed_steps(options), estimate)
+        request = self._request(options, choice)
+        return self._finish(integrate(self.model, request, progress, out), estimate)
 
-    def _short_run(
-        self, start: tuple[Any, Any], h: float | None, steps: Any, every: Any, params: Any,
-        method: str | None, t0: float,
-    ) -> Run | None:  # fmt: skip
-        """Simulate a short run by fixed steps in a single call of C.
+    def integrate(
+        self, request: Request, progress: Progress = None, out: tuple[Array, Array] | None = None
+    ) -> Trajectory:
+        """Make a run from checked arguments and return it, whatever its status."""
+        return integrate(self.model, request, progress, out)
 
-        Return None, and let the caller take the general path, if the run has many steps, does not
-        reach its end, or begins so late that its times need a check. start: q0 and qd0. The
-        arguments are those of `simulate`, of which only the initial state is checked already.
+    def _request(self, options: SimulationArguments, choice: StepChoice | None) -> Request:
+        """Check the arguments of `simulate` and return them; warn of a step size that is too large.
+
+        choice: checked steps from t = 0, if known. Raises ValueError if an argument is invalid.
         """
-        if not (type(steps) is type(every) is int and (method is None or type(method) is str)):
-            return None
-        info, (q0, qd0) = self.info, start
-        method = method or info.methods[0]
-        if (loop := self.loops.get(method)) is None or not 0 < every <= loop.short >= steps >= 0:
-            return None
-        h = info.h if h is None else as_step_size(h, info.dtype)
-        if abs(t0) > 1e6 * h or (steps >= MIN_STEPS and (method, h) not in self.warned):
-            return None
-        (from_q, from_qd, at_p), p = self.arguments.default_pointers, info.p0
-        if q0 is not None:
-            from_q = self.arguments.initial_half(q0, "q0")[1]
-        if qd0 is not None:
-            from_qd = self.arguments.initial_half(qd0, "qd0")[1]
-        if params is not None:
-            p = self.arguments.parameters(params).copy()
-            at_p = self.c.pointer(p)
-        address, real, null = self.c.tools
-        rows = empty((2, 1 - -steps // every, info.nq), info.dtype)
-        code = loop.run(
-            address(real, rows), null, from_q, from_qd, t0, h, steps, null, 0, every, at_p, null
-        )
-        if code != 8 * steps:
-            return None
-        evaluations = loop.stages * steps
-        return Run(self.model, t0, rows, h, steps, "ok", p, every, None, method, evaluations)
+        steps = self.checked_steps(options, choice)
+        q, qd, p = self._initial(options)
+        request = steps.request(q, qd, checked_inputs(self.model, options, steps, p), p)
+        self.check_step_size(request)
+        return request
 
-    def _initial(
-        self, options: SimulationArguments
-    ) -> tuple[Array, Array, Array, tuple[Any, Any, Any]]:
-        """Return q, qd and p at the start of a run, and all three in the form that C reads."""
+    def checked_steps(self, options: SimulationArguments, choice: StepChoice | None) -> StepChoice:
+        """Return the checked steps: `choice`, from t = 0, if these arguments permit it."""
+        is_other = self.ignores_events or options.times is not None or options.stiff is not False
+        if choice is None or is_other or type(options.t0) is not float or options.t0:
+            return StepChoice.from_arguments(self.info, options, self.ignores_events)
+        return choice
+
+    def _initial(self, options: SimulationArguments) -> tuple[Array, Array, Array]:
+        """Return copies of q, qd and the parameters at the start of a run."""
         (q, qd), p = self.info.initial_state, self.info.p0
-        from_q, from_qd, at_p = self.arguments.default_pointers
         if options.q0 is not None:
-            q, from_q = self.arguments.initial_half(options.q0, "q0")
+            q = self.arguments.initial_half(options.q0, "q0").copy()
         if options.qd0 is not None:
-            qd, from_qd = self.arguments.initial_half(options.qd0, "qd0")
+            qd = self.arguments.initial_half(options.qd0, "qd0").copy()
         if options.params is not None:
             p = self.arguments.parameters(options.params).copy()
-            at_p = self.c.pointer(p)
-        return q, qd, p, (from_q, from_qd, at_p)
+        return q, qd, p
 
-    def _fixed_steps(self, options: SimulationArguments) -> Run:
-        """Check the arguments of a run by fixed steps and simulate."""
-        method = self.info.method_name(options.method)
-        q, qd, p, c_arguments = self._initial(options)
-        h = self.info.h if options.h is None else as_step_size(options.h, self.info.dtype)
-        t0 = as_number(options.t0, "t0")
-        times, steps = options.output_times(t0, h)
-        steps = step_count(self.info, h, options.duration if times is None else None, steps)
-        every = min(as_count(options.every, "every", 1), MAX_EVERY)
-        u, hold = options.inputs_and_hold(self.info, t0, h, steps)
-        if u is None and options.control_period is not None and self.info.nu:
-            u = SampledSignal(self.model, options.params)
-        if steps >= MIN_STEPS and (method, h) not in self.warned:
-            self.check_step_size(
-                LinearizationState(q, qd, t0, self._first(u, steps, hold), p), h, method
-            )
-        return self.run(
-            FixedStepRequest(
-                q, qd, t0, h, steps, every, u, p, method, hold, times, options.out,
-                options.progress, c_arguments,
-            )
-        )  # fmt: skip
-
-    def _finish(self, run: Run, estimate: bool) -> Run:
+    def _finish(self, run: Trajectory, estimate: bool) -> Trajectory:
         """Issue the warnings of a run and estimate its error on request; return the run."""
         if run.status == "interrupted":
             raise Interrupted(run)
+        if run.status == "ok" and not estimate and self.has_plain_runs:
+            return run
         if words := run.message if run.status != "ok" else run.remark:
             warn(f"{self.info.name}: {words}")
         if estimate:
@@ -440,15 +388,21 @@ class Integrator(Component):
                 warn(f"{self.info.name}: {fault}")
         return run
 
-    def check_step_size(
-        self, state: LinearizationState, h: float, method: str, whose: str = ""
-    ) -> None:
-        """Warn, once a method and step size, if h, s, is beyond the stability limit.
+    def check_step_size(self, request: Request, whose: str = "") -> None:
+        """Warn, once a method and step size, if h is beyond the stability limit at the start.
 
-        state: initial state. whose: beginning of the message.
+        The first instance of a batch is checked. whose: beginning of the message.
         """
+        method, h = request.method, request.h
+        if request.steps < MIN_CHECKED_STEPS or (method, h) in self.warned:
+            return
         self.warned.add((method, h))
-        if words := advice(self.model, state, h, method):
+        arrays = request.q, request.qd, request.u, request.p
+        first: list[Any] = [
+            None if x is None or callable(x) else x[(0,) * (x.ndim - 1)] for x in arrays
+        ]
+        state = first[0], first[1], request.t0, first[2], first[3]
+        if words := _step_size_advice(self.model, state, h, method):
             warn(f"{self.info.name}: {whose}{words}")
 
     def advice(
@@ -483,134 +437,7 @@ class Integrator(Component):
         p, method = self.arguments.parameters(params), self.info.method_name(method)
         q, qd = self.arguments.state(*initial_state_for_parameters(self.model, q0, qd0, p))
         h = self.info.h if h is None else as_step_size(h, self.info.dtype)
-        return advice(self.model, LinearizationState(q, qd, as_number(t0, "t0"), u, p), h, method)
-
-    def run(self, request: FixedStepRequest) -> Run:
-        """Simulate by fixed steps from checked arguments; return the run, whatever its status."""
-        if request.times is not None:
-            return output_times.run(self.model, request, self.input_table(request))
-        steps, every, h, t0 = request.steps, request.every, request.h, request.t0
-        loop, nq, (address, real, null) = self.loops[request.method], self.info.nq, self.c.tools
-        law, inputs, stride = self.input_table(request)
-        q_rows, qd_rows = self._memory(request)
-        to_q, to_qd = address(real, q_rows), address(real, qd_rows)
-        at_u = null if inputs is None else address(real, inputs)
-        from_q, from_qd, at_p = request.c_arguments or (
-            self.c.pointer(x) for x in (request.q, request.qd, request.p)
-        )
-        # a step of an implicit method may solve for all its stages
-        numbers = nq**3 if loop.evaluations else nq
-        completed, chunk = 0, request.hold if law else FIRST_CALL_NUMBERS // numbers or 1
-        # workspace from call to call, with counters; a single call may do without
-        is_single = steps <= chunk and loop.evaluations is None and not self.info.constraints.names
-        work = null if is_single else self.c.ffi.new(loop.work_type)
-        try:
-            while True:
-                if law and completed < steps:
-                    row = -(-completed // every)
-                    # at the start the rows are still empty
-                    state = (q_rows[row], qd_rows[row]) if completed else (request.q, request.qd)
-                    inputs = law(t0 + completed * h, *state)
-                    at_u = address(real, inputs)
-                count = steps - completed
-                if count > chunk:
-                    count, start_time = chunk, perf_counter()
-                code = loop.run(
-                    to_q, to_qd, from_q, from_qd, t0, h, count, at_u, stride, every, at_p, work
-                )
-                completed, status = code >> 3, STATUS[code & 7]
-                if status != "ok":
-                    break
-                if request.progress is not None and completed:
-                    request.progress(completed, steps)
-                if completed == steps:
-                    break
-                if not law:
-                    chunk = next_chunk(count, perf_counter() - start_time)
-        except KeyboardInterrupt:
-            completed, status = work.completed if work else completed, "interrupted"
-            if not completed:
-                q_rows[0], qd_rows[0] = request.q, request.qd
-        if completed < steps:
-            count = 1 - -completed // every
-            q_rows, qd_rows = q_rows[:count], qd_rows[:count]
-        evaluations = loop.evaluations(work) if loop.evaluations else loop.stages * completed
-        stored = law.law if law else None if inputs is None else inputs.copy()
-        result = Run(
-            self.model, t0, (q_rows, qd_rows), h, completed, status, request.p, every, stored,
-            request.method, evaluations,
-        )  # fmt: skip
-        self.record_singular_steps(result, request.method, work)
-        if law:
-            result.hold = request.hold
-            result.applied_inputs = law.rows(len(result), self.info.nu)
-        return result
-
-    def _memory(self, request: FixedStepRequest) -> Any:
-        """Return q and qd of all rows, (rows, nq) each: those of the caller, or new ones."""
-        rows, nq = 1 - -request.steps // request.every, self.info.nq
-        try:
-            if request.out is not None:
-                return self.arguments.output_pair(request.out, (rows, nq))
-            if rows * nq > MIN_CHECKED_NUMBERS and self.info.row_bytes(rows) > machine_memory():
-                raise MemoryError
-            return empty((2, rows, nq), self.info.dtype)
-        except MemoryError:
-            raise MemoryError(
-                f"{rows} rows of {2 * nq} numbers don't fit in memory: keep fewer with every="
-            ) from None
-
-    def _first(self, u: Any, steps: int, hold: int) -> Array | None:
-        """Return the inputs of the first step; None for a signal or a function."""
-        inputs = self._table(u, steps, 1, hold)[1]
-        return inputs[0] if inputs is not None and inputs.ndim == 2 else inputs
-
-    def input_table(
-        self, request: FixedStepRequest
-    ) -> tuple[FeedbackLaw | None, Array | None, int]:
-        """Return the inputs of a run by fixed steps in the form that C takes.
-
-        The result is (law, inputs, stride): the feedback law u(t, q, qd), or None; the inputs as an
-        array, or None; the distance in that array between the inputs of two steps, 0 if they are
-        constant.
-        """
-        return self._table(request.u, request.steps, request.every, request.hold)
-
-    def _table(
-        self, u: Any, steps: int, every: int, hold: int
-    ) -> tuple[FeedbackLaw | None, Array | None, int]:
-        """Return (feedback law, constant inputs or rows, stride from step to step)."""
-        if u is None:
-            return None, None, 0
-        if not self.info.nu:
-            raise ValueError("u: this scene has no inputs")
-        if callable(u):
-            if hold == 1:
-                warn_called_each_step(self.model)
-            return FeedbackLaw(u, self.arguments.inputs, every, hold), None, 0
-        if isinstance(u, Mapping):
-            u = self.arguments.inputs_by_name(u)
-        array = self.arguments.numbers(u, "u")
-        if self.info.nu == 1 and array.ndim < 2 and array.size:
-            array = array.reshape((-1, 1) if array.size > 1 else 1)
-        array = self.arguments.array(array, "u", self.info.nu)
-        if array.ndim == 1:
-            return None, array, 0
-        if len(array) != -(-steps // hold):
-            what = "step" if hold == 1 else f"control period of {hold} steps"
-            raise ValueError(
-                f"u: {len(array)} rows for {steps} steps: give one row a {what}, or the duration= "
-                "or steps= that the rows cover"
-            )
-        return None, array if hold == 1 else np.repeat(array, hold, axis=0)[:steps], self.info.nu
-
-    def record_singular_steps(self, run: Any, method: str, work: Any) -> None:
-        """Store the singular steps of a run, which C counted."""
-        if not self.info.constraints.names:
-            return
-        run.singular_steps = getattr(self.c.lib, f"{method}_singular")(work)
-        if run.singular_steps:
-            run.first_singular = run.t0 + getattr(self.c.lib, f"{method}_first")(work)
+        return _step_size_advice(self.model, (q, qd, as_number(t0, "t0"), u, p), h, method)
 
 
 def _refuse(q: Array, qd: Array, t: float, step: int, status: str) -> None:
@@ -620,3 +447,95 @@ def _refuse(q: Array, qd: Array, t: float, step: int, status: str) -> None:
     raise MotionError(
         f"no derivative of a step{later} from t = {t:.9g}, {state_text(q, qd)}: {what}", status
     )
+
+
+def _step_size_advice(model: CompiledModel, state: _State, h: float, method: str) -> str | None:
+    """Return a message if the step size h is too large for a stable run from a state, else None.
+
+    state: q, qd, time, inputs (None: the scene's signals) and parameters. h: step size, s. method:
+    name of the method.
+
+    The motion is linearised at the state. The largest |imaginary part| and the fastest decay of its
+    eigenvalues are compared with the two stability limits of the method. A mode whose speed depends
+    on the width of the finite differences comes from a discontinuity of the forces and is ignored.
+    """
+    limits = model.info.method_table[method]
+    undamped, decaying = limits.oscillation_limit, limits.decay_limit
+    turning, decay = _fastest_modes(model, state, 1.0)
+    modes = ((undamped, turning), (decaying, decay))
+    longest = min((limit / rate for limit, rate in modes if rate), default=inf)
+    if not 0 < longest < abs(h):
+        return None
+    if max(_fastest_modes(model, state, 100.0)) < max(turning, decay) / 2:
+        return None
+    if undamped * decay > decaying * turning:
+        mode = f"fastest decay {decay:.3g} 1/s"
+    else:
+        mode = f"fastest mode {turning:.3g} rad/s"
+    return (
+        f"h = {abs(h):g} s is beyond {method}'s stability limit of about {longest:.2g} s here "
+        f"({mode} at the start)"
+    )
+
+
+def _fastest_modes(model: CompiledModel, state: _State, wide: float) -> tuple[float, float]:
+    """Return (largest |Im|, fastest decay) of the eigenvalues at a state, 1/s; 0 if unknown.
+
+    The linearisation is the module's own where available, else a finite difference of the
+    acceleration, whose width is `wide` times the usual one. With constraints there are two
+    spectra, of all perturbations and of those tangent to the constraints; the slower one counts.
+    """
+    q, qd, t, u, params = state
+    n, x = model.info.nq, np.concatenate([q, qd]).astype(float)
+    near = wide * sqrt(float(np.finfo(model.info.dtype).eps)) * np.maximum(1.0, np.abs(x))
+
+    def spectrum(ways: Array) -> tuple[float, float]:
+        """Return (largest |Im|, fastest decay) of the linearised motion's eigenvalues, 1/s.
+
+        ways: (2 nq, k), orthonormal columns; the motion is linearised in these directions only.
+        """
+        moved = near[:, None] * ways
+        # signals may depend on the state
+        if model.functions.has_slopes and (u is not None or not model.info.nu):
+            A = model.functions.linearize(q, qd, t=t, u=u, params=params)[0]
+            rates = A.astype(float) @ moved
+        else:
+            states = np.vstack([x, x + moved.T]).astype(model.info.dtype)
+            a = model.functions.acceleration(states[:, :n], states[:, n:], t, u, params)
+            a = a.astype(float)
+            rates = np.vstack([moved[n:], (a[1:] - a[0]).T])
+        values = np.linalg.eigvals(ways.T @ (rates / near[:, None]))
+        turning, decay = np.max(np.abs(values.imag), initial=0), np.max(-values.real, initial=0)
+        return float(turning), float(decay)
+
+    modes: list[tuple[float, float]] = []  # if empty, the run itself reports the error
+    with suppress(ArithmeticError, np.linalg.LinAlgError):
+        modes.append(spectrum(np.eye(2 * n)))
+    if model.info.constraints.names:
+        with suppress(ArithmeticError, np.linalg.LinAlgError):
+            modes.append(spectrum(_tangent_basis(model, x, t, params, near)))
+    return min(modes, key=max, default=(0.0, 0.0))
+
+
+def _tangent_basis(model: CompiledModel, x: Array, t: float, params: Any, near: Array) -> Array:
+    """Return an orthonormal basis (2 nq, k) of the tangent space of the constraints.
+
+    Perturbations of x = [q; qd] are in units of `near`.
+    """
+    n, holonomic = model.info.nq, model.info.constraints.holonomic
+    q, qd = (half.astype(model.info.dtype) for half in (x[:n], x[n:]))
+    A = model.constraints.constraint_jacobian(q, t=t, params=params).astype(float)
+    sizes = np.maximum(np.linalg.norm(A * near[n:], axis=1), 1e-300)  # rows have units of their own
+    back = A * near[n:] / sizes[:, None]
+    of_q = rank.null_space((A * near[:n])[:holonomic], model.info.dtype)
+    places = np.vstack([q, x[:n] + (near[:n, None] * of_q).T]).astype(model.info.dtype)
+    rates = model.constraints.constraint_rates(
+        places, np.tile(qd, (len(places), 1)), t, params
+    ).astype(float)
+    follow = (
+        -np.linalg.pinv(back, rcond=rank.tolerance(model.info.dtype))
+        @ ((rates[1:] - rates[0]) / sizes).T
+    )
+    of_qd = rank.null_space(back, model.info.dtype)
+    whole = np.block([[of_q, np.zeros((n, of_qd.shape[1]))], [follow, of_qd]])
+    return np.asarray(np.linalg.qr(whole)[0])

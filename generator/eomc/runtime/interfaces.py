@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 from .arguments import Arguments
-from .c_library import CLibrary
 from .constraints import Constraints
 from .frames import Frames
 from .functions import Functions
-from .info import SceneInfo
+from .info import CLibrary, SceneInfo
 
 
 class CompiledModel(Protocol):

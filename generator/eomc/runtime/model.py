@@ -9,19 +9,16 @@ from __future__ import annotations
 from typing import Any, Self
 
 from . import saved
-from .adaptive import AdaptiveRun
 from .arguments import Arguments
 from .atomic_write import File
-from .c_library import CLibrary
 from .constraints import Constraints
 from .frames import Frames
 from .functions import Functions
-from .info import SceneInfo
+from .info import CLibrary, SceneInfo
 from .integrator import Integrator
-from .output_times import TimedRun
 from .package import MODEL, option, reduced
 from .statics import Statics
-from .trajectory import Run
+from .trajectory import Trajectory
 
 
 class Model:
@@ -84,7 +81,7 @@ class Model:
     @property
     def trajectory_classes(self) -> dict[str, Any]:
         """The classes of runs by their names."""
-        return {x.__name__: x for x in (Run, TimedRun, AdaptiveRun)}
+        return {"Trajectory": Trajectory}
 
     def load_run(self, file: File) -> Any:
         """Load a run, or a batch of runs, from an .npz file that `run.save` has written.
@@ -99,8 +96,7 @@ class Model:
 
         Returns
         -------
-        Run or batch of runs
-            Of the class that was saved.
+        Trajectory or BatchTrajectory
 
         Raises
         ------
@@ -114,4 +110,4 @@ class Model:
             raise ValueError(
                 f"{file}: is a run of many at once: build the module with {option('batch')}"
             )
-        return run_class.from_arrays(model, arrays)
+        return saved.from_arrays(run_class, model, arrays)

@@ -105,13 +105,17 @@ def call_path(path: str, arguments: tuple[Any, ...]) -> Any:
     path: the name relative to this package, such as "status.MotionError". arguments: arguments of
     the call.
     """
+    return _located(path)(*arguments)
+
+
+def _located(path: str) -> Any:
+    """Return a function or class of this package by its name, as in `call_path`."""
     first, *rest = path.split(".")
     if first.startswith("_"):  # an attribute of the built package, not a module of its runtime
         start, names = import_module(_BUILT), [first, *rest]
     else:
         start, names = import_module(f"{__package__}.{first}"), rest
-    value: Any = functools.reduce(getattr, names, start)
-    return value(*arguments)
+    return functools.reduce(getattr, names, start)
 
 
 def unpickled(pickled: tuple[Any, ...], path: str, arguments: tuple[Any, ...]) -> Any:
@@ -154,6 +158,13 @@ def refusal(pickled: tuple[Any, ...], path: str) -> str:
             )
     if own.dtype != other.dtype:
         return f"{name}: this was pickled in {other.dtype}; the build here has {own.dtype}"
+    try:
+        _located(path)
+    except (AttributeError, ModuleNotFoundError):
+        return (
+            f"{name}: this was pickled by an earlier version of eomc, whose build is gone: "
+            "simulate again, or load a file that run.save wrote"
+        )
     warn(
         f"{name}: this was pickled by another build of the scene, which is gone; what is computed "
         "from it now is of the present version"
@@ -198,7 +209,8 @@ class Unreadable:
 
 
 _ONLY_OF_SCENES = ("frames", "momentum")  # options that concern bodies
-_SPELLED = {"true": "True", "method": "methods"}  # of [run], as System.make has it
+# of [run], as System.make has it
+_SPELLED = {"true": "True", "method": "methods", '"stick"': "{...}"}
 
 
 def option(key: str, value: str = "true") -> str:
@@ -255,9 +267,9 @@ def initial_value_message(model: Any, name: str) -> str:
 # common names of other packages for the arguments of a run
 _CALLED = {
     "dt": "h", "step": "h", "step_size": "h", "stepsize": "h", "timestep": "h", "rtol": "tol",
-    "atol": "tol", "eps": "tol", "h_most": "max_step", "h_max": "max_step", "t_eval": "times",
-    "tmax": "duration", "t": "duration", "t_end": "duration", "t_final": "duration",
-    "t_span": "duration", "x0": "q0", "v0": "qd0",
+    "atol": "tol", "tolerance": "tol", "eps": "tol", "h_most": "max_step", "h_max": "max_step",
+    "t_eval": "times", "tmax": "duration", "t": "duration", "t_end": "duration",
+    "t_final": "duration", "t_span": "duration", "x0": "q0", "v0": "qd0",
 }  # fmt: skip
 
 

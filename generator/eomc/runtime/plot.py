@@ -1,12 +1,16 @@
-"""Curves of runs, phase portraits and sections, drawn with matplotlib; copied beside a module.
+"""Curves of runs, phase portraits and sections, drawn with matplotlib, and summaries in notebooks.
 
 Names, units and values alone are drawn here, in the style that matplotlib is set to.
 """
 
 from __future__ import annotations
 
+import base64
+import io
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from html import escape
+from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,10 +19,8 @@ from .arguments import Array, not_one_of
 from .atomic_write import File
 from .columns import imported
 from .labels import mathtext, plain, rate_unit, with_unit
+from .package import require_eomc
 
-CURVES_PER_PANEL = 6  # approximate number
-MAX_SIZE_RATIO = 30.0  # of the largest to the smallest curve of a panel
-MAX_PANELS = 4  # of one kind, grouped by size; with more, the size is ignored
 MAX_ROWS = 20_000  # of a drawn curve
 
 
@@ -57,12 +59,14 @@ def grouped(curves: Sequence[Curve]) -> list[list[Curve]]:
 
     Return the panels, each a list of its curves.
     """
+    # approximate number of curves in a panel; panels of one kind, beyond which size is ignored
+    few, max_panels = 6, 4
     panels: list[list[Curve]] = []
     for kind in dict.fromkeys((c.kind, c.unit) for c in curves):
         mine = [c for c in curves if (c.kind, c.unit) == kind]
         parts = _by_size(mine)
-        for part in parts if len(parts) <= MAX_PANELS else [mine]:
-            count = -(-len(part) // max(CURVES_PER_PANEL, -(-len(curves) // MAX_PANELS)))
+        for part in parts if len(parts) <= max_panels else [mine]:
+            count = -(-len(part) // max(few, -(-len(curves) // max_panels)))
             size = -(-len(part) // count)
             panels += [part[k : k + size] for k in range(0, len(part), size)]
     return panels
@@ -70,13 +74,14 @@ def grouped(curves: Sequence[Curve]) -> list[list[Curve]]:
 
 def _by_size(curves: Sequence[Curve]) -> list[list[Curve]]:
     """Group curves by size; a curve joins the first panel with curves of similar size."""
+    max_ratio = 30.0  # of the largest to the smallest curve of a panel
     panels: list[tuple[list[Curve], list[float]]] = []
     for curve in curves:
         finite = curve.values[np.isfinite(curve.values)]
         size = float(np.max(np.abs(finite), initial=0.0))
         for members, sizes in panels:
             some = [x for x in (*sizes, size) if x > 0]
-            if not some or max(some) <= MAX_SIZE_RATIO * min(some):
+            if not some or max(some) <= max_ratio * min(some):
                 members.append(curve)
                 sizes.append(size)
                 break
@@ -129,7 +134,7 @@ class Source:
     def __init__(self, run: Any, wrap: bool | Collection[str] = False) -> None:
         model, run = run.model, getattr(run, "curve_run", run)
         self.run, self.t = run, np.asarray(run.t, float)
-        self.is_held = getattr(run, "input_source", None) is not None
+        self.is_held = run.request.u is not None
         self.coordinates = tuple(model.info.coordinates)
         self._units = dict(model.info.units)
         self._energy = "J" if any(self._units.get(c) for c in model.info.coordinates) else ""
@@ -166,34 +171,64 @@ class Source:
         return Curve(name, values, self._energy, "energy", symbol)
 
 
+class Figure(NamedTuple):
+    """Arguments of the methods `plot` of runs and batches that concern the whole figure."""
+
+    wrap: bool | str | Collection[str] = False
+    ax: Any = None
+    axes: Any = None
+    file: File | None = None
+    style: Mapping[str, Any] = {}
+
+    def panels(self, count: int, portraits: int = 0) -> list[Any]:
+        """Return the Axes of `count` panels and of phase portraits: the user's, or new ones.
+
+        Raises ValueError if `ax` and `axes` are both given, or their number does not fit.
+        """
+        if self.ax is None and self.axes is None:
+            return new_axes(count, portraits)
+        if self.ax is not None and self.axes is not None:
+            raise ValueError("ax, axes: give one of them")
+        name, all_axes = "axes", [*np.ravel(self.axes)]
+        if self.ax is not None:
+            name, all_axes = "ax", [self.ax]
+        if len(all_axes) != count + portraits:
+            raise ValueError(
+                f"{name}: {len(all_axes)} for {count + portraits} panels: give axes=, one a panel"
+            )
+        return all_axes
+
+    def finish(self, all_axes: Sequence[Any]) -> Any:
+        """Write the figure to the file, if there is one; return its Axes, several as an array."""
+        if self.file is not None:
+            figure = all_axes[0].figure
+            getattr(figure, "figure", figure).savefig(self.file)  # of a part of a figure the whole
+        return all_axes[0] if len(all_axes) == 1 else np.array(all_axes)
+
+
 def plot(
-    run: Any, names: Sequence[str], phase: Any, section: Mapping[str, Array] | None, other: Any,
-    labels: Sequence[str] | None, wrap: bool | Collection[str], ax: Any, axes: Any,
-    file: File | None, style: Mapping[str, Any],
+    run: Any, names: Sequence[str], figure: Figure, phase: Any = None, other: Any = (),
+    section: Mapping[str, Array] | None = None, labels: Sequence[str] | None = None,
 ) -> Any:  # fmt: skip
     """Draw a run, and others to compare, with matplotlib; return the Axes.
 
-    The arguments are those of `Run.plot`.
+    The arguments are those of `Trajectory.plot`.
     """
     no_files(names)
     others = [other] if hasattr(other, "model") else [*(other or ())]
-    sources = [Source(each, wrap) for each in (run, *others)]
+    sources = [Source(each, figure.wrap) for each in (run, *others)]
     suffixes = _suffixes(len(sources), labels)
     pairs = _pairs(phase, sources[0])
     columns = [*names] or ([] if pairs else sources[0].default())
     panels = grouped([sources[0].curve(name) for name in columns])
-    if ax is not None and panels:
+    if figure.ax is not None and panels:
         panels = [[c for panel in panels for c in panel]]
-    count = len(panels) + len(pairs)
-    if ax is None and axes is None:
-        all_axes = new_axes(len(panels), len(pairs))
-    else:
-        all_axes = check_axes(ax, axes, count)
+    all_axes = figure.panels(len(panels), len(pairs))
     for place, panel in zip(all_axes, panels, strict=False):
-        _panel(place, sources, [c.name for c in panel], suffixes, style)
+        _panel(place, sources, [c.name for c in panel], suffixes, figure.style)
     for place, (x, y) in zip(all_axes[len(panels) :], pairs, strict=True):
-        _portrait(place, sources, x, y, suffixes, section, style)
-    return finished(all_axes, file)
+        _portrait(place, sources, x, y, suffixes, section, figure.style)
+    return figure.finish(all_axes)
 
 
 def no_files(names: Sequence[str]) -> None:
@@ -204,17 +239,6 @@ def no_files(names: Sequence[str]) -> None:
     for name in names:
         if str(name).endswith((".png", ".pdf", ".svg")):
             raise ValueError(f"plot: '{name}' is no column: give file='{name}' to write a picture")
-
-
-def finished(all_axes: Sequence[Any], file: File | None) -> Any:
-    """Write the figure to `file`, unless that is None, and return its Axes.
-
-    all_axes: the Axes of the figure. A single one is returned as it is, several as an array.
-    """
-    if file is not None:
-        figure = all_axes[0].figure
-        getattr(figure, "figure", figure).savefig(file)  # of a part of a figure the whole
-    return all_axes[0] if len(all_axes) == 1 else np.array(all_axes)
 
 
 def _suffixes(count: int, labels: Sequence[str] | None) -> list[str]:
@@ -254,21 +278,6 @@ def new_axes(panels: int, portraits: int = 0) -> list[Any]:
         all_axes += columns[0].subplots(panels, 1, sharex=True, squeeze=False)[:, 0].tolist()
     if portraits:
         all_axes += columns[-1].subplots(portraits, 1, squeeze=False)[:, 0].tolist()
-    return all_axes
-
-
-def check_axes(ax: Any, axes: Any, count: int) -> list[Any]:
-    """Return the user's Axes as a list, one for each of `count` panels.
-
-    ax: one Axes, or None. axes: array of Axes, or None. Raises ValueError if both are given or
-    their number differs from `count`.
-    """
-    if ax is not None and axes is not None:
-        raise ValueError("ax, axes: give one of them")
-    all_axes = [ax] if ax is not None else [*np.ravel(axes)]
-    if len(all_axes) != count:
-        name = "ax" if ax is not None else "axes"
-        raise ValueError(f"{name}: {len(all_axes)} for {count} panels: give axes=, one a panel")
     return all_axes
 
 
@@ -320,43 +329,32 @@ def _portrait(
         axes.legend()
 
 
-class FanOptions(NamedTuple):
-    """Arguments of `BatchRun.plot` besides the names of columns."""
+def draw_fan(
+    run: Any, names: Sequence[str], figure: Figure, quantiles: Sequence[float],
+    lines: int | None = None, over: Any = None,
+) -> Any:  # fmt: skip
+    """Draw the distribution of a batch over time with matplotlib and return the Axes.
 
-    quantiles: Sequence[float]
-    lines: int | None
-    over: Any
-    wrap: bool | str | Sequence[str]
-    ax: Any
-    axes: Any
-    file: File | None
-    style: dict[str, Any]
-
-
-def draw_fan(run: Any, names: Sequence[str], options: FanOptions) -> Any:
-    """Draw the distribution of a batch over time with matplotlib and return the Axes."""
-    quantiles, lines, over, wrap, ax, axes, file, style = options
+    The arguments are those of `BatchTrajectory.plot`.
+    """
     no_files(names)
-    source = Source(run, wrap)
+    source, style = Source(run, figure.wrap), figure.style
     curves = [source.curve(name) for name in ([*names] or source.coordinates)]
-    if ax is None and axes is None:
-        panels = new_axes(len(curves))
-    else:
-        panels = check_axes(ax, axes, len(curves))
+    panels = figure.panels(len(curves))
     for place, curve in zip(panels, curves, strict=True):
         if over is not None:
             _ends(place, curve, *_over(run, over), style)
-        elif lines is not None:
+            continue
+        if lines is not None:
             for k in np.unique(np.linspace(0, len(run) - 1, min(lines, len(run))).astype(int)):
                 each = replace(curve, values=curve.values[k])
                 against(place, source.t, [each], **{"linewidth": 0.6, "color": "C0", **style})
         else:
             _bands(place, source.t, curve, sorted(quantiles), style)
-        if over is None:
-            place.set_ylabel(with_unit(curve.text, curve.unit))
+        place.set_ylabel(with_unit(curve.text, curve.unit))
     if over is None:
         panels[-1].set_xlabel(with_unit(mathtext("t"), "s"))
-    return finished(panels, file)
+    return figure.finish(panels)
 
 
 def _bands(axes: Any, t: Array, curve: Curve, quantiles: Sequence[float], style: Any) -> None:
@@ -386,7 +384,7 @@ def _over(run: Any, over: Any) -> tuple[str, Array]:
         if over not in names:
             raise ValueError(not_one_of("over", over, ("instance", *names)))
         unit = run.model.info.units.get(over, "")
-        values = np.broadcast_to(run.parameter_values[:, names.index(over)], (len(run),))
+        values = np.broadcast_to(run.request.p[:, names.index(over)], (len(run),))
         return with_unit(mathtext(over), unit), values
     values = np.asarray(over, float)
     if values.shape != (len(run),):
@@ -402,3 +400,70 @@ def _ends(axes: Any, curve: Curve, label: str, x: Array, style: Any) -> None:
     axes.plot(x, y, **{"linestyle": "none", "marker": ".", **style})
     axes.set_xlabel(label)
     axes.set_ylabel(with_unit(f"{curve.text} at the end", curve.unit))
+
+
+def html(run: Any) -> str:
+    """Return a summary of a run as HTML: status, final state, error and a small picture.
+
+    Names and titles from the scene are escaped, and nothing is loaded from URLs. Without matplotlib
+    there is no picture.
+    """
+    model, most = run.model, 12  # coordinates in the table
+    words = [f"{run.steps} steps of {run.method}, {run.description}"]
+    words += [f"to t = {run.t[-1]:g} s"] if len(run) else []
+    words.append(f"status: {run.status}" if run.status == "ok" else run.message)
+    if run.error is not None:
+        error = max(float(np.max(x[-1])) for x in (run.error.q, run.error.qd))
+        words.append(run.error.warning or f"error at the end about {error:.1g}")
+    rows = ["<tr><td>at the end</td></tr>"] if len(run) else []
+    for k, name in enumerate(model.info.coordinates[:most] if len(run) else ()):
+        unit = plain(model.info.units.get(name, ""))
+        q, qd = (f"{x[-1, k] + 0.0:.9g}" for x in (run.q, run.qd))  # no -0
+        cells = (name, f"{q} {unit}", f"{name}_dot", f"{qd} {unit and unit + '/s'}")
+        rows.append("<tr>" + "".join(f"<td>{escape(c)}</td>" for c in cells) + "</tr>")
+    if (more := len(model.info.coordinates) - most) > 0:
+        rows.append(f"<tr><td>and {more} more</td></tr>")
+    title = plain(model.info.title or model.info.name).replace(r"\$", "$")
+    parts = [f"<b>{escape(title)}</b>", *(escape(plain(w)) for w in words)]
+    return f"<div>{'<br>'.join(parts)}<table>{''.join(rows)}</table>{_picture(run)}</div>"
+
+
+def _picture(run: Any) -> str:
+    """Return an image (HTML) of the coordinates over time; "" without matplotlib.
+
+    The mechanism is drawn beside them if eomc is installed and the scene describes its shape.
+    """
+    if not len(run) or find_spec("matplotlib") is None:
+        return ""
+    from matplotlib import figure as figures
+    from matplotlib import rc_context
+
+    source = Source(run)
+    names = list(source.coordinates)
+    panels = grouped([source.curve(name) for name in names])[:3]
+    shown = [c.name for panel in panels for c in panel]
+    drawn = _mechanism(run)
+    with rc_context({"text.usetex": False}):
+        height = max(1.6 * len(panels) + 0.5, 3.2 if drawn else 0)
+        figure = figures.Figure(figsize=(9 if drawn else 6, height), layout="constrained", dpi=80)
+        grid = figure.add_gridspec(len(panels), 2 if drawn else 1)
+        axes = [figure.add_subplot(grid[0, 0])]
+        axes += [figure.add_subplot(grid[k, 0], sharex=axes[0]) for k in range(1, len(panels))]
+        plot(run, shown, Figure(axes=axes))
+        for above in axes[:-1]:
+            above.tick_params(labelbottom=False)
+        if drawn:
+            drawn.draw(figure.add_subplot(grid[:, 1]))
+        file = io.BytesIO()
+        figure.savefig(file, format="png")
+    data = base64.b64encode(file.getvalue()).decode("ascii")
+    description = "over time: " + ", ".join(shown) + ("; and the mechanism" if drawn else "")
+    return f'<img alt="{escape(description, quote=True)}" src="data:image/png;base64,{data}">'
+
+
+def _mechanism(run: Any) -> Any:
+    """Return the object that draws the mechanism of a run; None without eomc or shapes."""
+    try:
+        return require_eomc("report.picture").of_run(run)
+    except ImportError:
+        return None

@@ -1,11 +1,15 @@
-"""Save and load runs as .npz files: arrays only, no pickles, and the scene's identity."""
+"""Runs as values: their fields, equality and copies, and .npz files of arrays without pickles."""
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import zipfile
 import zlib
+from collections.abc import Mapping
+from copy import deepcopy
+from dataclasses import Field, fields
 from pathlib import Path
 from typing import Any
 
@@ -14,39 +18,186 @@ import numpy as np
 from .arguments import Array
 from .atomic_write import File, atomic_write
 from .interfaces import CompiledModel
-from .package import eventful, warn
+from .package import eventful, own_model, warn
+from .requests import Request, count_steps
 
-KINDS = {  # names of classes in files, and the classes
-    "Run": "Run",
-    "AdaptiveRun": "AdaptiveRun",
-    "SteppedRun": "AdaptiveRun",  # fixed steps with events, in files of earlier versions
-    "TimedRun": "TimedRun",
-    "BatchRun": "BatchRun",
-    "TimedBatchRun": "TimedBatchRun",
-    "AdaptiveBatchRun": "AdaptiveBatchRun",
+LEFT_OUT = "u was a function, which a pickled or saved run does not contain: simulate again"
+NOT_STORED = "u was a function, and its values between rows are not stored: take every=1"
+# names of classes in files, of this version and of earlier ones
+KINDS = {
+    "Trajectory 2": "Trajectory",
+    "BatchTrajectory 2": "BatchTrajectory",
+    "Run 1": "Trajectory",
+    "TimedRun 1": "Trajectory",
+    "AdaptiveRun 1": "Trajectory",
+    "SteppedRun 1": "Trajectory",
+    "BatchRun 1": "BatchTrajectory",
+    "TimedBatchRun 1": "BatchTrajectory",
+    "AdaptiveBatchRun 1": "BatchTrajectory",
 }
 _WRITTEN = 'load_run reads what run.save("NAME.npz") wrote'
-_KIND = "eomc {} 1"  # name of the class and version of the format
+
+
+def field_values(run: Any) -> dict[str, Any]:
+    """Return the values of all fields of a run by name."""
+    return {field.name: getattr(run, field.name) for field in fields(run)}
+
+
+def deep_copies(run: Any, memo: dict[int, Any]) -> dict[str, Any]:
+    """Return copies of the values of all fields; the model is the same one."""
+    values = field_values(run)
+    return {"model": values.pop("model")} | deepcopy(values, memo)
+
+
+def pickled_values(run: Any) -> dict[str, Any]:
+    """Return the values of the fields that a pickle contains: without the model and functions.
+
+    The build that reads the pickle has its own model. The request becomes a tuple.
+    """
+    values = field_values(run)
+    del values["model"]
+    return values | {"request": tuple(_without_function(values["request"]))}
+
+
+def completed(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of fields, from a pickle or a file, with a model and a request."""
+    model = values.get("model") or own_model()
+    return {**values, "model": model, "request": Request(*values["request"])}
+
+
+def _without_function(request: Request) -> Request:
+    return request.replace(u=LEFT_OUT) if callable(request.u) else request
+
+
+def are_equal(run: Any, other: Any) -> bool:
+    """Return True if two runs of the same class have the same scene and equal fields."""
+    ours, theirs = run.model.info, other.model.info
+    return (ours.name, ours.digest) == (theirs.name, theirs.digest) and all(
+        _is_same(getattr(run, name), getattr(other, name))
+        for field in _stored_fields(run)
+        if field.compare
+        for name in (("q", "qd") if field.name == "rows" else (field.name,))
+    )
+
+
+def _is_same(a: Any, b: Any) -> bool:
+    """Return True if two values are equal, bit by bit; of requests all but the inputs."""
+    if isinstance(a, Request) and isinstance(b, Request):
+        a, b = (tuple(x.replace(u=None, period=0.0, periods=0)) for x in (a, b))
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        return np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
+    if isinstance(a, tuple) and isinstance(b, tuple):
+        return len(a) == len(b) and all(map(_is_same, a, b))
+    if isinstance(a, float) and math.isnan(a):
+        return isinstance(b, float) and math.isnan(b)
+    return type(a) is type(b) and bool(a == b)
+
+
+def _stored_fields(run: Any) -> list[Field[Any]]:
+    """Return the fields of a run that are saved."""
+    return [field for field in fields(run) if field.name not in ("model", "error")]
 
 
 def write(run: Any, path: Path) -> None:
-    """Write a run or batch to an .npz file: its columns, and the arguments that reproduce it."""
-    model = run.model
-    info = model.info
+    """Write a run or batch to an .npz file: its columns, and the fields that reproduce it.
+
+    Fields of the request have the prefix "request_"; a tuple becomes one array for each entry.
+    """
+    model, info = run.model, run.model.info
     arrays: dict[str, Any] = {
-        "kind": _KIND.format(type(run).__name__), "scene": info.name, "digest": info.digest,
+        "kind": f"eomc {type(run).__name__} 2", "scene": info.name, "digest": info.digest,
         "coordinates": info.coordinates, "parameters": info.parameters, "inputs": info.inputs,
-        "events": info.events,
-        "t": run["t"], "energy": run.energy, "u": run.u,
+        "events": info.events, "t": run.t, "energy": run.energy, "u": run.u, "q": run.q,
+        "qd": run.qd,
     }  # fmt: skip
     if additional := model.extension_of:
         arrays |= {"own": additional[0].info.digest, "asked": _text(additional[1])}
     if model.functions.has_jacobi:
         arrays["jacobi"] = run.jacobi
-    arrays |= {name: value for name, value in run.to_arrays().items() if value is not None}
-    converted: Any = {name: np.asarray(value) for name, value in arrays.items()}
+    request = _without_function(run.request)
+    arrays |= request.to_mapping("request_")
+    names = (field.name for field in _stored_fields(run) if field.name not in ("rows", "request"))
+    for name in names:
+        value = getattr(run, name)
+        if isinstance(value, tuple):
+            arrays |= {f"{name}_{k}": part for k, part in enumerate(value)}
+        else:
+            arrays[name] = value
+    converted: Any = {name: np.asarray(x) for name, x in arrays.items() if x is not None}
     with atomic_write(path) as new, new.open("wb") as file:
         np.savez(file, **converted)
+
+
+def from_arrays(run_class: Any, model: CompiledModel, arrays: Mapping[str, Any]) -> Any:
+    """Create a run from the arrays and numbers of a file."""
+    if "request_t0" not in arrays:
+        arrays = _present_arrays(model, arrays)
+    values: dict[str, Any] = {"model": model, "rows": (arrays["q"], arrays["qd"])}
+    values["request"] = Request.from_mapping(arrays, "request_")
+    for field in fields(run_class):
+        if field.name in arrays:
+            values[field.name] = arrays[field.name]
+        elif f"{field.name}_0" in arrays:
+            parts = (f"{field.name}_{k}" for k in range(len(arrays)))
+            values[field.name] = tuple(arrays[part] for part in parts if part in arrays)
+    return run_class.restore(values)
+
+
+# fields by the names that earlier versions gave them
+_EARLIER_NAMES = {
+    "q": "q", "qd": "qd", "steps": "steps", "status": "status", "status_codes": "codes",
+    "evaluations": "evaluations", "times": "times", "rejected": "rejected",
+    "stiff_steps": "stiff_steps", "stopped": "stopped", "limit": "limit", "end_time": "reached",
+    "singular_steps": "singular_steps", "first_singular": "first_singular",
+    "period_inputs": "values", "request_t0": "t0", "request_t_end": "t_end",
+    "request_every": "every", "request_u": "held", "request_period": "period",
+    "request_periods": "periods", "request_p": "params", "request_method": "method",
+    "request_tol": "tol", "request_stiff": "stiff",
+    "request_max_evaluations": "_max_evaluations",
+}  # fmt: skip
+
+
+def _present_arrays(model: CompiledModel, old: Mapping[str, Any]) -> dict[str, Any]:
+    """Convert the arrays of a file that an earlier version wrote to those of this version."""
+    prefixed = {"_times": "times", "_begin": "begin", "_h_most": "h_most", "_stiff": "stiff",
+                "_period": "period", "_by": "by"}  # fmt: skip
+    old = {prefixed.get(name, name): value for name, value in old.items()}
+    new = {now: old[name] for now, name in _EARLIER_NAMES.items() if name in old}
+    is_batch, has_equal_steps = "codes" in old, "h_most" not in old
+    is_adaptive = not (has_equal_steps or old.get("by"))
+    h = 0.0 if is_adaptive else old["h" if has_equal_steps else "h_most"]
+    steps, times = old.get("wanted", old["steps"]), np.asarray(old.get("times", ()))
+    if is_adaptive:
+        steps = 0
+    elif len(times):
+        steps = count_steps(times, old["t0"], h)
+    begin = old.get("begin", (old["q"][..., 0, :], old["qd"][..., 0, :]))
+    new |= {
+        "request_q": begin[0], "request_qd": begin[1], "request_h": h, "request_steps": steps,
+        "request_max_step": old["h_most"] if is_adaptive else 0.0,
+        "request_detects_events": not has_equal_steps and len(old.get("events", ())) > 0,
+    }  # fmt: skip
+    for name, value in (("every", 1), ("period", 0.0), ("periods", 0)):
+        new.setdefault(f"request_{name}", value)
+    new.setdefault("request_t_end", old["t0"] + h * steps if has_equal_steps else float(times[-1]))
+    if is_batch:
+        new["request_u"] = old.get("_u", old.get("held"))
+        stages = model.info.method_table.get(old["method"])
+        new.setdefault("evaluations", stages and stages.stages * old["steps"])
+        new["stopped_codes"] = new.pop("stopped", None)
+    else:
+        if not has_equal_steps:
+            new["end_time"] = old["t0"] + old["h"] * old["steps"] if is_adaptive else old["t_end"]
+        if (applied := old.get("applied")) is not None and "values" not in old:
+            # inputs at the rows are those of the steps if there is a row after each step
+            new |= {"period_inputs": applied, "request_period": h * old["every"]}
+            new["request_u"] = LEFT_OUT if old["every"] == 1 else NOT_STORED
+        elif "values" in old and "held" not in old:
+            new["request_u"] = LEFT_OUT
+    if "which" in old:
+        parts = (old.get("event_instances"), old["which"], old["event_rows"])[not is_batch :]
+        new |= {f"event_data_{k}": part for k, part in enumerate(parts)}
+    return {name: value for name, value in new.items() if value is not None}
 
 
 def _text(events: Any) -> str:
@@ -66,16 +217,15 @@ def read(model: CompiledModel, file: File) -> tuple[Any, str, dict[str, Any]]:
     the scene, OSError if it cannot be read.
     """
     arrays = _arrays(file)
-    kind = next((k for k in KINDS if str(arrays.get("kind")) == _KIND.format(k)), "")
-    if not kind:
+    kind = KINDS.get(str(arrays.get("kind")).removeprefix("eomc "))
+    if kind is None:
         raise ValueError(f"{file}: was not written by run.save in this version of eomc")
     if arrays["scene"] != model.info.name:
         raise ValueError(f"{file}: is a run of {arrays['scene']}, not of {model.info.name}")
     if str(arrays.get("own", arrays["digest"])) != model.info.digest:
         warn(
             f"{model.info.name}: {file}: was saved from another version of the scene; what is "
-            "computed "
-            "from it now is of the present version"
+            "computed from it now is of the present version"
         )
     if "asked" in arrays:
         model = _model_with_events(model, arrays, file)
@@ -91,7 +241,7 @@ def read(model: CompiledModel, file: File) -> tuple[Any, str, dict[str, Any]]:
         raise ValueError(
             f"{file}: has numbers of {arrays['q'].dtype}, {model.info.name} {model.info.dtype}"
         )
-    return model, KINDS[kind], {name: x.item() if x.ndim == 0 else x for name, x in arrays.items()}
+    return model, kind, {name: x.item() if x.ndim == 0 else x for name, x in arrays.items()}
 
 
 def _model_with_events(model: CompiledModel, arrays: dict[str, Array], file: File) -> Any:

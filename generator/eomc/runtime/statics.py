@@ -2,37 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arguments import Array, Parameters, Start, as_number, not_one_of
+from . import rank
+from .arguments import Array, Parameters, Start, as_names, as_number
+from .info import SceneInfo
 from .interfaces import CompiledModel
 from .package import Component, reduced
-from .starts import initial_state_for_parameters, values_by_name
-from .status import MotionError, state_text
+from .requests import initial_state_for_parameters, values_by_name
+from .status import MotionError, refuse, state_text
 
-# relative to the largest singular value: rows below it are linearly dependent
-_DEPENDENT = {"float64": 1e-9, "float32": 1e-4}
+_DEPENDENT = 1e-11  # singular values of finite differences below it, relative to the largest, are 0
 # largest residual of the force balance and of the constraint rows, relative to their terms
 _RESIDUAL = {"float64": 1e-6, "float32": 1e-3}
-
-
-def actuated_coordinates(model: CompiledModel, drives: Sequence[str] | None) -> list[int]:
-    """Return the sorted indices of the coordinates along which actuators act.
-
-    drives: names of these coordinates; None: all coordinates. Raises ValueError for unknown names.
-    """
-    if drives is None:
-        return [*range(model.info.nq)]
-    names = (drives,) if isinstance(drives, str) else tuple(drives)
-    for name in names:
-        if name not in model.info.coordinates:
-            raise ValueError(not_one_of("drives", str(name), model.info.coordinates))
-    return sorted({model.info.coordinates.index(name) for name in names})
 
 
 class Motion(NamedTuple):
@@ -63,33 +50,6 @@ class Motion(NamedTuple):
     D: Array
     A: Array
     free: Array
-
-    @classmethod
-    def from_states(
-        cls,
-        model: CompiledModel,
-        q: Array,
-        qd: Array,
-        qdd: Array,
-        force: Array,
-        t: Any,
-        params: Any,
-    ) -> Motion:
-        """Evaluate D, A and the accelerations `free` at the states, and return the motion.
-
-        q, qd, qdd: (nq,) or (n, nq), positions, velocities and accelerations. force: required sum
-        of actuator and constraint forces, of the same shape. t: time, s. params: parameters. Raises
-        MotionError if an acceleration does not exist.
-        """
-        D, A, free = (
-            model.functions.D(q, t=t, params=params),
-            np.zeros((*q.shape[:-1], 0, model.info.nq)),
-            qdd,
-        )
-        if len(model.info.constraints.names) > len(model.info.constraints.redundant):
-            A = model.constraints.constraint_jacobian(q, t=t, params=params)
-            free = model.functions.acceleration(q, qd, t, params=params)
-        return cls(q, qd, *(np.asarray(x, float) for x in (qdd, force, D, A, free)))
 
     def state(self, k: tuple[int, ...]) -> Motion:
         """Return the motion at the single state with index k, such as (3,); () for one state."""
@@ -125,21 +85,21 @@ def drive_forces(model: CompiledModel, which: list[int], motion: Motion) -> tupl
         If D is not positive definite or a value is not finite.
     """
     kind, force, D = str(model.info.dtype), motion.force, motion.D
-    rows, least = model.info.constraints, _DEPENDENT[kind]
+    rows, least = model.info.constraints, rank.tolerance(kind)
     solved = [k for k in range(len(rows.names)) if k not in rows.redundant]
     A = motion.A[solved] if solved else motion.A
     if solved:
         _check_constraints(A, [rows.names[k] for k in solved], motion, _RESIDUAL[kind])
     if not all(np.isfinite(x).all() for x in (D, A, force)):
-        words = "D, a force or a constraint's slope is not finite there"
-        raise MotionError(f"at {state_text(motion.q, motion.qd)}: {words}", "not finite")
-    tangent = _null_space(A, least)
+        what = "D, a force or a constraint's slope is not finite there"
+        refuse("not finite", motion.q, motion.qd, what=what)
+    tangent = rank.null_space(A, kind)
     B, right = tangent.T[:, which], tangent.T @ force
     try:
         L = np.linalg.cholesky(np.linalg.inv(_regularised(D, A))[np.ix_(which, which)])
     except np.linalg.LinAlgError:
-        words = "D is not positive definite there, so no force is the least"
-        raise MotionError(f"at {state_text(motion.q, motion.qd)}: {words}", "singular") from None
+        what = "D is not positive definite there, so no force is the least"
+        refuse("singular", motion.q, motion.qd, what=what)
     solution = np.linalg.lstsq(np.linalg.solve(L, B.T).T, right, rcond=least)[0]
     tau = np.zeros(model.info.nq)
     tau[which] = np.linalg.solve(L.T, solution)
@@ -151,7 +111,8 @@ def drive_forces(model: CompiledModel, which: list[int], motion: Motion) -> tupl
             f" others, or more; there are {len(right)} freedoms"
         )
     multipliers = np.zeros(len(rows.names))
-    multipliers[solved] = np.linalg.lstsq(A.T, force - tau, rcond=least)[0]
+    sizes = np.maximum(np.linalg.norm(A, axis=1), np.finfo(float).tiny)
+    multipliers[solved] = np.linalg.lstsq((A.T / sizes), force - tau, rcond=least)[0] / sizes
     return tau, multipliers
 
 
@@ -169,27 +130,11 @@ def _check_constraints(A: Array, names: list[str], motion: Motion, tolerance: fl
         )
 
 
-def _null_space(A: Array, least: float) -> Array:
-    """Return an orthonormal basis (nq, k) of the null space of A."""
-    if not len(A):
-        return np.eye(A.shape[1])
-    _, sizes, directions = np.linalg.svd(A / np.maximum(np.linalg.norm(A, axis=1)[:, None], 1e-300))
-    return np.asarray(directions[int((sizes > least * sizes[0]).sum()) :].T)
-
-
 def _regularised(D: Array, A: Array) -> Array:
     """Return D, plus a multiple of A^T A if D is singular."""
     if np.linalg.cond(D) < 1e12:
         return D
     return np.asarray(D + A.T @ A * (np.trace(D) / np.sum(A**2)))
-
-
-_MOST = 100  # maximum number of Newton steps
-_RANK_TOLERANCE = 1e-9  # relative to the largest singular value of A: rank tolerance
-_SHORTEST = 2.0**-20  # smallest fraction of a Newton step in the line search
-_TRIES, _STRIDE = 24, 0.2  # restarts of Newton's method; step between them, rad or relative
-
-_Function = Callable[[Array], Array]
 
 
 class Equilibrium(NamedTuple):
@@ -211,117 +156,163 @@ class Equilibrium(NamedTuple):
         return reduced("statics.Equilibrium", *self)
 
 
-def equilibrium(
-    model: CompiledModel, q: Array, qd: Array, u: Array | None, free: Collection[str], t: float,
-    params: Any,
-) -> Equilibrium:  # fmt: skip
-    """Solve tau + A^T lambda = C qd + g for the variables in `free`, by Newton's method.
+@dataclass(frozen=True)
+class _Equations:
+    """Equations of an equilibrium, tau + A^T lambda = C qd + g, as functions of z = [q; qd; u].
 
-    q, qd, u: initial guess of the variables in `free`, and the values of all other variables. If u
-    is None, the inputs are the scene's signals. free: names of coordinates, velocities (such as
-    "theta_dot") and inputs. t: time, s. Raises MotionError if no solution is found, ValueError for
-    an unknown name.
+    The residual is a force, not an acceleration, since D may be singular. With constraints it has
+    two further parts: the residuals of the velocity constraints, and the time derivatives of these
+    residuals. Steps are tangent to the position constraints.
 
-    The residual is a force, not an acceleration, since D may be singular. The Jacobian is a finite
-    difference; its error slows convergence but does not affect the result. Newton steps of
-    underdetermined systems are those of minimum norm.
-
-    With constraints, the residual has three parts: the forces that multipliers cannot balance, the
-    residuals of the velocity constraints, and the time derivatives of these residuals. Steps are
-    tangent to the position constraints.
+    moved: mask (len(z),) of the variables that are solved for. t: time, s. z has no inputs if they
+    are the scene's signals.
     """
-    n, known = model.info.nq, (*model.info.states, *model.info.inputs)
-    if strange := [name for name in free if name not in known]:
-        raise ValueError(not_one_of("free", strange[0], known))
-    moved = np.array([name in free for name in known])
-    if u is None and np.any(moved[2 * n :]):
-        u = np.asarray(model.functions.signal(q, qd, t, params))
-    z = np.concatenate([q, qd, np.empty(0) if u is None else u]).astype(float)
-    moved = moved[: len(z)]
-    rows = _Rows(model, moved, t, params) if model.info.constraints.names else None
 
-    def inputs(z: Array) -> Array | None:
-        """Return the inputs in z = [q; qd; u]; None for the signals of the scene."""
-        return None if u is None else z[2 * n :]
+    model: CompiledModel
+    moved: Array
+    t: float
+    params: Any
 
-    def forces(z: Array) -> Array:
-        """Return tau - C qd - g (nq,) at z."""
-        at, moving = z[:n], z[n : 2 * n]
-        tau = model.functions.tau(at, moving, t, inputs(z), params)
-        values: Array = tau.astype(float) - model.functions.bias(at, moving, t=t, params=params)
-        return values
+    @property
+    def eps(self) -> float:
+        """Relative spacing of the numbers of the module."""
+        return float(np.finfo(self.model.info.dtype).eps)
 
-    def residual(z: Array) -> Array:
-        """Return the residual at z = [q; qd; u], the vector that Newton's method reduces to zero.
+    def split(self, z: Array) -> tuple[Array, Array, Array | None]:
+        """Return positions, velocities and inputs; None for the signals of the scene."""
+        n = self.model.info.nq
+        return z[:n], z[n : 2 * n], z[2 * n :] if len(z) > 2 * n else None
 
-        It is tau - C qd - g (nq,) without constraints, else `_Rows.residual`, (nq + 2 nc,).
+    def forces(self, z: Array) -> Array:
+        """Return tau - C qd - g, (nq,)."""
+        functions, (q, qd, u) = self.model.functions, self.split(z)
+        tau = functions.tau(q, qd, self.t, u, self.params).astype(float)
+        return np.asarray(tau - functions.bias(q, qd, self.t, self.params))
+
+    def jacobian(self, z: Array) -> Array:
+        """Return the Jacobian A of the constraint equations, (nc, nq)."""
+        if not self.model.info.constraints.names:
+            return np.zeros((0, self.model.info.nq))
+        A = self.model.constraints.constraint_jacobian(self.split(z)[0], self.t, self.params)
+        return A.astype(float)
+
+    def residual(self, z: Array) -> Array:
+        """Return the vector (nq + 2 nc,) that Newton's method reduces to zero.
+
+        Its parts are: the part of the forces that no A^T lambda can balance, (nq,); the residuals
+        of the velocity constraints, (nc,); the time derivatives of these residuals, for constant
+        velocities, (nc,), as a central difference.
         """
-        return rows.residual(z, forces(z)) if rows else forces(z)
-
-    eps = float(np.finfo(model.info.dtype).eps)
-    onto = rows.onto if rows else lambda z: z
-
-    def D(z: Array) -> Array:
-        """Return the mass matrix (nq, nq) at z."""
-        matrix: Array = model.functions.D(z[:n], t=t, params=params)
-        return matrix.astype(float)
-
-    def directions(z: Array) -> Array:
-        """Return the directions (k, len(z)) in which z = [q; qd; u] may change, one in each row."""
-        return rows.tangent_basis(z) if rows else np.eye(len(z))[moved]  # (k, len(z))
-
-    z, downhill, tried = onto(z), None, list[tuple[Array, Array]]()
-    for _ in range(_TRIES):
-        z, now, sizes = _newton(z, n, residual, onto, directions, eps)
-        sizes[:n] = np.max(sizes[:n], initial=0) + (np.max(np.abs(forces(z))) if rows else 0.0)
-        if rows:
-            sizes[n:] += rows.sizes(z)
-        much = now * ~(np.abs(now) <= np.sqrt(eps) * sizes)  # a smaller residual is rounding error
-        tried.append((z, much))
-        if not much.any():
-            break
-        downhill = _downhill(
-            model, z if downhill is None else downhill, directions, forces, onto, D
+        forces, (q, qd, _) = self.forces(z), self.split(z)
+        if not self.model.info.constraints.names:
+            return forces
+        tangent = rank.null_space(self.jacobian(z), self.model.info.dtype)
+        short = np.cbrt(self.eps) / self._pace(z)
+        rates = self.model.constraints.constraint_rates
+        before, now, then = (
+            rates(q + e * qd, qd, self.t + e, self.params).astype(float)
+            for e in (-short, 0.0, short)
         )
+        return np.concatenate([tangent @ (tangent.T @ forces), now, (then - before) / (2 * short)])
+
+    def sizes(self, z: Array, terms: Array) -> Array:
+        """Return the magnitudes of the terms of the residual, from those of its derivatives."""
+        n, sizes = self.model.info.nq, terms.copy()
+        sizes[:n] = np.max(sizes[:n], initial=0)
+        if self.model.info.constraints.names:
+            rates = np.abs(self.jacobian(z)) @ np.abs(self.split(z)[1])
+            sizes[:n] += np.max(np.abs(self.forces(z)))
+            sizes[n:] += np.concatenate([rates, rates * self._pace(z)])
+        return sizes
+
+    def _pace(self, z: Array) -> float:
+        """Return the relative rate of change of the state, 1/s."""
+        q, qd, _ = self.split(z)
+        return float(np.max(np.abs(qd) / np.maximum(1.0, np.abs(q)), initial=1.0))
+
+    def project(self, z: Array) -> Array:
+        """Project the free coordinates onto the constraints; raise MotionError if that fails."""
+        n = self.model.info.nq
+        if not self.model.info.constraints.names:
+            return z
+        fixed = [not x for x in self.moved[:n]] + [False] * n
+        q, _ = self.model.constraints.project_fixed(z[:n], np.zeros(n), self.t, self.params, fixed)
+        return np.concatenate([q, z[n:]])
+
+    def moved_by(self, z: Array, step: Array) -> Array | None:
+        """Return z + step, projected onto the constraints; None if the projection fails."""
+        try:
+            return self.project(z + step)
+        except MotionError:
+            return None
+
+    def directions(self, z: Array) -> Array:
+        """Return orthonormal directions (k, len(z)) in which z may change, one in each row.
+
+        Free coordinates change tangentially to the position constraints. Each free velocity or
+        input adds one direction.
+        """
+        n, free = self.model.info.nq, np.flatnonzero(self.moved[: self.model.info.nq])
+        A = self.jacobian(z)[: self.model.info.constraints.holonomic, free]
+        basis = rank.null_space(A, self.model.info.dtype).T
+        directions = np.zeros((len(basis), len(z)))
+        directions[:, free] = basis
+        return np.concatenate([directions, np.eye(len(z))[n:][self.moved[n:]]])
+
+
+def _equilibrium(equations: _Equations, guess: Array) -> Array:
+    """Solve the equations from a guess by Newton's method; raise MotionError without a solution.
+
+    The Jacobian is a finite difference; its error slows convergence but does not affect the result.
+    Newton steps of underdetermined systems are those of minimum norm. If they end in a local
+    minimum of the residual, they begin again downhill from it.
+    """
+    max_restarts = 24
+    z, downhill, first = equations.project(guess), None, None
+    for _ in range(max_restarts):
+        z, residual, terms = _newton(equations, z)
+        # a smaller residual is rounding error
+        is_rounding = np.abs(residual) <= np.sqrt(equations.eps) * equations.sizes(z, terms)
+        excess = np.where(is_rounding, 0.0, residual)
+        first = first or (z, excess)
+        if not excess.any():
+            break
+        downhill = _downhill(equations, z if downhill is None else downhill)
         if downhill is None:
             break
         z = downhill
-    if much.any():
-        z, much = tried[0]
-    _refuse(model, z, much, (q, qd), inputs(z), t, params)
-    at, moving = (x.astype(model.info.dtype) for x in (z[:n], z[n : 2 * n]))
-    if u is not None:
-        return Equilibrium(at, moving, z[2 * n :].astype(model.info.dtype))
-    signals = np.asarray(model.functions.signal(at, moving, t, params)) if model.info.nu else None
-    return Equilibrium(at, moving, signals)
+    if excess.any() and first:
+        z, excess = first
+    _refuse(equations, z, excess, guess)
+    return z
 
 
-def _newton(
-    z: Array, n: int, residual: _Function, onto: _Function, directions_of: _Function, eps: float
-) -> tuple[Array, Array, Array]:
-    """Minimise `residual` from z by Newton's method; return (z, residual, sizes of its terms).
-
-    directions_of: directions (k, len(z)) in which z may change; onto: projection on constraints.
-    """
-    now = residual(z)
+def _newton(equations: _Equations, z: Array) -> tuple[Array, Array, Array]:
+    """Minimise the residual from z by Newton's method; return z, it and the sizes of its terms."""
+    max_steps, min_fraction = 100, 2.0**-20  # of a step in the line search
+    n, width = equations.model.info.nq, np.cbrt(equations.eps)
+    now = equations.residual(z)
     sizes = np.full(len(now), np.inf)
-    for _ in range(_MOST):
-        ways = directions_of(z)
-        reach = np.maximum(1.0, np.abs(ways) @ np.abs(z))
-        near = np.cbrt(eps) * reach[:, None] * ways
-        columns = [residual(onto(z + e)) - residual(onto(z - e)) for e in near]
-        slope = np.reshape(columns, (-1, len(now))).T / (2 * np.cbrt(eps) * reach)
+    for _ in range(max_steps):
+        directions = equations.directions(z)
+        reach = np.maximum(1.0, np.abs(directions) @ np.abs(z))
+        ends = [
+            [equations.residual(equations.project(z + side * e)) for side in (1, -1)]
+            for e in width * reach[:, None] * directions
+        ]
+        columns = [after - before for after, before in ends]
+        slope = np.reshape(columns, (-1, len(now))).T / (2 * width * reach)
         sizes = np.abs(slope) @ reach
-        if not np.isfinite(sizes.sum() + now @ now) or not len(ways):
+        if not np.isfinite(sizes.sum() + now @ now) or not len(directions):
             break
-        along = -np.linalg.lstsq(slope, now, rcond=1e-11)[0]
-        step = along @ ways
+        along = -np.linalg.lstsq(slope, now, rcond=_DEPENDENT)[0]
+        step = along @ directions
         fall = 1e-3 * (now @ slope @ along)  # sufficient decrease for a full step
         # a coordinate changes by 1, or its own size, at most, since angles are periodic
         part = 1 / max(1.0, *(np.abs(step[:n]) / np.maximum(1.0, np.abs(z[:n]))))
-        while part > _SHORTEST:
-            there = _tried(onto, z + part * step)
-            new = None if there is None else residual(there)
+        while part > min_fraction:
+            there = equations.moved_by(z, part * step)
+            new = None if there is None else equations.residual(there)
             if new is not None and new @ new < now @ now + part * fall:
                 break
             part /= 2
@@ -332,189 +323,84 @@ def _newton(
     return z, now, sizes
 
 
-def _downhill(
-    model: CompiledModel,
-    z: Array,
-    directions_of: _Function,
-    forces: _Function,
-    onto: _Function,
-    inertia: _Function,
-) -> Array | None:
+def _downhill(equations: _Equations, z: Array) -> Array | None:
     """Return a step from z along the accelerations from rest; None if they vanish.
 
     It leaves local minima of the residual, as halfway between two equilibria.
     """
-    n, ways = model.info.nq, directions_of(z)
-    ways = ways[:, :n][np.any(ways[:, :n], axis=1)]
-    if not len(ways):
+    stride = 0.2  # rad or relative
+    n, directions = equations.model.info.nq, equations.directions(z)
+    directions = directions[:, :n][np.any(directions[:, :n], axis=1)]
+    D = equations.model.functions.D(z[:n], equations.t, equations.params).astype(float)
+    D, forces = directions @ D @ directions.T, directions @ equations.forces(z)
+    if not (len(D) and np.isfinite(D).all() and np.isfinite(forces).all()):
         return None
-    D, pushes = ways @ inertia(z) @ ways.T, ways @ forces(z)[:n]
-    if not (np.isfinite(D).all() and np.isfinite(pushes).all()):
-        return None
-    step = np.linalg.lstsq(D, pushes, rcond=1e-11)[0] @ ways
+    step = np.linalg.lstsq(D, forces, rcond=_DEPENDENT)[0] @ directions
     size = np.max(np.abs(step) / np.maximum(1.0, np.abs(z[:n])), initial=0.0)
     if not 0 < size < np.inf:
         return None
-    return _tried(onto, z + np.concatenate([_STRIDE / size * step, np.zeros(len(z) - n)]))
+    return equations.moved_by(z, np.concatenate([stride / size * step, np.zeros(len(z) - n)]))
 
 
-def _refuse(
-    model: CompiledModel, z: Array, much: Array, guess: tuple[Array, Array], u: Array | None,
-    t: float, params: Any,
-) -> None:  # fmt: skip
+def _refuse(equations: _Equations, z: Array, excess: Array, guess: Array) -> None:
     """Raise MotionError if the search ended with a residual above rounding error."""
-    q, qd = z[: model.info.nq], z[model.info.nq : 2 * model.info.nq]
-    why = _too_much(model, much) if much.any() else _slips(model, q, qd, u, t, params)
+    info, (q, qd, _) = equations.model.info, equations.split(z)
+    why = _largest_residual(info, excess) if excess.any() else _slip(equations, z)
     if not why:
         return
+    q0, qd0, _ = equations.split(guess)
     end = f"q = {np.array2string(q, precision=6, threshold=12)}"
-    if np.any(qd != guess[1]):
+    if np.any(qd != qd0):
         end = state_text(q, qd)
     raise MotionError(
-        f"no equilibrium found from {state_text(*guess)}: the search ends at {end}, where "
-        f"{why}{_beyond(model, q, qd, u, t, params)}; start elsewhere, or let "
-        f"another coordinate, rate (free=[..., '{model.info.states[model.info.nq]}']) or input "
-        "be free",
+        f"no equilibrium found from {state_text(q0, qd0)}: the search ends at {end}, where "
+        f"{why}{_exceeded_limits(equations, z)}; start elsewhere, or let another coordinate, rate "
+        f"(free=[..., '{info.states[info.nq]}']) or input be free",
         "no convergence",
     )
 
 
-def _too_much(model: CompiledModel, left: Array) -> str:
+def _largest_residual(info: SceneInfo, residual: Array) -> str:
     """Describe the largest residual: of a velocity constraint, or of a force."""
-    n = model.info.nq
-    rates, changes = np.split(left[n:], 2)
+    forces, rates, changes = np.split(residual, [info.nq, (info.nq + len(residual)) // 2])
     for values, words in ((rates, "break {} by {:.3g}"), (changes, "break {}, by {:.3g} a second")):
         if values.any():
             worst = int(np.argmax(np.abs(values)))
-            return f"the rates {words.format(model.info.constraints.names[worst], values[worst])}"
-    worst = int(np.argmax(np.abs(left[:n])))
-    return f"a force of {left[worst]:.3g} is left on {model.info.coordinates[worst]}"
+            return f"the rates {words.format(info.constraints.names[worst], values[worst])}"
+    worst = int(np.argmax(np.abs(forces)))
+    return f"a force of {forces[worst]:.3g} is left on {info.coordinates[worst]}"
 
 
-def _slips(
-    model: CompiledModel, q: Array, qd: Array, u: Array | None, t: float, params: Any
-) -> str:
+def _slip(equations: _Equations, z: Array) -> str:
     """Describe a joint whose static friction is exceeded; "" if there is none."""
+    model, (q, qd, u) = equations.model, equations.split(z)
+    others = equations.t, u, equations.params
     if not model.info.constraints.modes:
         return ""
-    holds = dict(
-        zip(
-            model.info.constraints.names,
-            model.constraints.multipliers(q, qd, t, u, params),
-            strict=True,
-        )
-    )
+    values = model.constraints.multipliers(q, qd, *others)
+    multipliers = dict(zip(model.info.constraints.names, values, strict=True))
     for at, of in model.info.constraints.modes:
         name, sliding = model.info.coordinates[of], q.copy()
         sliding[at] = 1.0
-        friction, rest = (model.functions.tau(x, qd, t, u, params)[of] for x in (sliding, q))
-        most, force = abs(friction - rest), abs(holds[f"{name}_sticks"])
+        friction, rest = (model.functions.tau(x, qd, *others)[of] for x in (sliding, q))
+        most, force = abs(friction - rest), abs(multipliers[f"{name}_sticks"])
         if not q[at] and force > most * (1 + 1e-6):
             return f"{name} slips, as {force:.3g} is more than its friction holds, {most:.3g}"
     return ""
 
 
-def _beyond(
-    model: CompiledModel, q: Array, qd: Array, u: Array | None, t: float, params: Any
-) -> str:
+def _exceeded_limits(equations: _Equations, z: Array) -> str:
     """Describe the inputs that exceed their limits; "" if there are none."""
-    if not model.functions.has_limits:
+    functions, (q, qd, u) = equations.model.functions, equations.split(z)
+    if not functions.has_limits:
         return ""
-    requested = model.functions.signal(q, qd, t, params) if u is None else u
-    cut = requested != model.functions.applied(q, qd, t, u, params)
-    names = [name for name, far in zip(model.info.inputs, cut, strict=True) if far]
-    return f", with {', '.join(names)} beyond {'their' if names[1:] else 'its'} limits" * bool(
-        names
-    )
-
-
-def _tried(onto: _Function, z: Array) -> Array | None:
-    """Return `onto(z)`; None if the projection fails."""
-    try:
-        return onto(z)
-    except MotionError:
-        return None
-
-
-@dataclass(frozen=True)
-class _Rows:
-    """Constraint equations of a model as functions of z = [q; qd; u], (len(z),).
-
-    moved: mask (len(z),) of the free variables. t: time, s.
-    """
-
-    model: CompiledModel
-    moved: Array
-    t: float
-    params: Any
-
-    def onto(self, z: Array) -> Array:
-        """Return z = [q; qd; u] with its free coordinates projected onto the constraints.
-
-        Raises MotionError if the projection fails.
-        """
-        n = self.model.info.nq
-        fixed = [not x for x in self.moved[:n]] + [False] * n
-        q, _ = self.model.constraints.project_fixed(z[:n], np.zeros(n), self.t, self.params, fixed)
-        return np.concatenate([q, z[n:]])
-
-    def tangent_basis(self, z: Array) -> Array:
-        """Return an orthonormal basis (k, len(z)) of directions in which z = [q; qd; u] may change.
-
-        Free coordinates change tangentially to the position constraints. Each free velocity or
-        input adds one direction.
-        """
-        n, moved = self.model.info.nq, np.flatnonzero(self.moved[: self.model.info.nq])
-        _, s, V = np.linalg.svd(self._slopes(z)[: self.model.info.constraints.holonomic, moved])
-        rank = int(np.sum(s > _RANK_TOLERANCE * np.max(s, initial=0)))
-        ways = np.zeros((len(moved) - rank, len(z)))
-        ways[:, moved] = V[rank:]
-        return np.concatenate([ways, np.eye(len(z))[n:][self.moved[n:]]])
-
-    def residual(self, z: Array, forces: Array) -> Array:
-        """Return the three parts of the residual of a scene with constraints, joined to one vector.
-
-        z: [q; qd; u]. forces: tau - C qd - g at z, (nq,). The parts are:
-        the part of `forces` that no A^T lambda can balance, (nq,);
-        the residuals of the velocity constraints, (nc,);
-        the time derivatives of these residuals, for constant velocities, (nc,), as a central
-        difference.
-        """
-        A, (q, qd) = self._slopes(z), self._halves(z)
-        forces = forces - A.T @ np.linalg.lstsq(A.T, forces, rcond=_RANK_TOLERANCE)[0]
-        short = np.cbrt(np.finfo(self.model.info.dtype).eps) / self._pace(z)
-        before, now, then = (
-            self.model.constraints.constraint_rates(q + e * qd, qd, self.t + e, self.params).astype(
-                float
-            )
-            for e in (-short, 0.0, short)
-        )
-        return np.concatenate([forces, now, (then - before) / (2 * short)])
-
-    def sizes(self, z: Array) -> Array:
-        """Return the magnitudes (2 nc,) of the terms in the last 2 nc entries of `residual`.
-
-        These entries are the residuals of the velocity constraints and their time derivatives. The
-        magnitudes are the scales of these entries. z: [q; qd; u].
-        """
-        sizes = np.abs(self._slopes(z)) @ np.abs(self._halves(z)[1])
-        return np.concatenate([sizes, sizes * self._pace(z)])
-
-    def _halves(self, z: Array) -> tuple[Array, Array]:
-        n = self.model.info.nq
-        return z[:n], z[n : 2 * n]
-
-    def _pace(self, z: Array) -> float:
-        """Return the relative rate of change of the state, 1/s."""
-        q, qd = self._halves(z)
-        return float(np.max(np.abs(qd) / np.maximum(1.0, np.abs(q)), initial=1.0))
-
-    def _slopes(self, z: Array) -> Array:
-        q, t = z[: self.model.info.nq], self.t
-        A: Array = self.model.constraints.constraint_jacobian(q, t=t, params=self.params).astype(
-            float
-        )
-        return A
+    t, params = equations.t, equations.params
+    requested = functions.signal(q, qd, t, params) if u is None else u
+    beyond = requested != functions.applied(q, qd, t, u, params)
+    names = [name for name, far in zip(equations.model.info.inputs, beyond, strict=True) if far]
+    if not names:
+        return ""
+    return f", with {', '.join(names)} beyond {'their' if names[1:] else 'its'} limits"
 
 
 class Statics(Component):
@@ -565,7 +451,9 @@ class Statics(Component):
         MotionError
             If D is not positive definite or a value is not finite.
         """
-        which = actuated_coordinates(self.model, drives)
+        coordinates, rows = self.info.coordinates, self.info.constraints
+        names = coordinates if drives is None else as_names("drives", drives, coordinates)
+        which = sorted({coordinates.index(name) for name in names})
         force = self.model.frames.inverse_dynamics(q, qd, qdd, f_ext, t=t, params=params)
         force = force - self.model.functions.tau(
             q, qd, t, np.zeros(self.info.nu) if self.info.nu else None, params
@@ -573,8 +461,13 @@ class Statics(Component):
         at, moving = self.arguments.state(q, qd)
         each = self.arguments.for_each_state(qdd, "qdd", (self.info.nq,), at)
         tau = np.empty_like(at)
-        multipliers = np.empty((*at.shape[:-1], len(self.info.constraints.names)), at.dtype)
-        motion = Motion.from_states(self.model, at, moving, each, force, t, params)
+        multipliers = np.empty((*at.shape[:-1], len(rows.names)), at.dtype)
+        D, A = self.model.functions.D(at, t, params), np.zeros((*at.shape[:-1], 0, self.info.nq))
+        free = each
+        if len(rows.names) > len(rows.redundant):
+            A = self.model.constraints.constraint_jacobian(at, t, params)
+            free = self.model.functions.acceleration(at, moving, t, params=params)
+        motion = Motion(at, moving, *(np.asarray(x, float) for x in (each, force, D, A, free)))
         for k in np.ndindex(at.shape[:-1]):
             tau[k], multipliers[k] = drive_forces(self.model, which, motion.state(k))
         return tau, multipliers
@@ -614,13 +507,7 @@ class Statics(Component):
         MotionError
             If no equilibrium is found; its status is "no convergence".
         """
-        if isinstance(free, str):
-            free = (free,)
-        if not (free is None or isinstance(free, Iterable)):
-            raise ValueError(
-                f"free: {free!r} is no list of names: "
-                f"{', '.join((*self.info.states, *self.info.inputs))}"
-            )
+        known = (*self.info.states, *self.info.inputs)
         rates: Any = qd
         by_name = values_by_name(self.model, rates, 1)
         if by_name is not None:
@@ -632,12 +519,21 @@ class Statics(Component):
         else:
             moving = self.info.with_discrete(rates, 1)
         q = self.info.with_discrete(q, 0)
-        at, moving = self.arguments.one_state(
-            *initial_state_for_parameters(self.model, q, moving, self.arguments.parameters(params))
+        at, moving = self.arguments.state(
+            *initial_state_for_parameters(self.model, q, moving, self.arguments.parameters(params)),
+            many=False,
         )
-        moves = [
-            name for name in self.info.coordinates if name not in self.info.discrete_coordinates
-        ]
-        names = moves if free is None else tuple(free)
-        inputs = self.arguments.inputs(u)
-        return equilibrium(self.model, at, moving, inputs, names, as_number(t, "t"), params)
+        names = self.info.coordinates[: self.info.nq - self.info.discrete_count]
+        if free is not None:
+            names = as_names("free", free, known)
+        moved, t = np.array([name in names for name in known]), as_number(t, "t")
+        inputs, signal = self.arguments.inputs(u), self.model.functions.signal
+        if inputs is None and np.any(moved[2 * self.info.nq :]):
+            inputs = np.asarray(signal(at, moving, t, params))
+        z = np.concatenate([at, moving, np.empty(0) if inputs is None else inputs]).astype(float)
+        equations = _Equations(self.model, moved[: len(z)], t, params)
+        q, qd, u = equations.split(_equilibrium(equations, z))
+        q, qd = (x.astype(self.info.dtype) for x in (q, qd))
+        if u is None:
+            u = np.asarray(signal(q, qd, t, params)) if self.info.nu else None
+        return Equilibrium(q, qd, u if u is None else u.astype(self.info.dtype))

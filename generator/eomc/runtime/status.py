@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -61,7 +61,7 @@ class Interrupted(KeyboardInterrupt):
 
     Attributes
     ----------
-    run : Run
+    run : Trajectory or BatchTrajectory
         The run up to the interruption.
     """
 
@@ -75,6 +75,25 @@ class Interrupted(KeyboardInterrupt):
     def _render_traceback_(self) -> list[str]:
         """Return the text that IPython prints: the message without the traceback."""
         return [f"{type(self).__name__}: {self}"]
+
+
+def refuse(status: str, q: Any, qd: Any, k: Any = 0, what: str = "") -> NoReturn:
+    """Raise MotionError for a state, or for state number k of many, (n, nq).
+
+    what: the reason; by default that of the status.
+    """
+    where = state_text(*(np.atleast_2d(x)[k] for x in (q, qd)))
+    raise MotionError(f"at {where}: {what or STATUS_MESSAGES[status]}", status)
+
+
+def check_finite(values: Array, axes: int, q: Any, qd: Any, what: str) -> None:
+    """Raise MotionError for the first state at which a value is not finite.
+
+    values: (..., n) for the states q and qd, with `axes` axes for each. what: the reason.
+    """
+    is_finite = np.atleast_1d(np.isfinite(values).all(axis=tuple(range(-axes, 0))))
+    if not is_finite.all():
+        refuse("not finite", q, qd, int(np.argmin(is_finite)), f"{what} is not finite there")
 
 
 def state_text(q: Array, qd: Array) -> str:

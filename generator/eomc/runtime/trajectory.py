@@ -1,36 +1,39 @@
-"""The public interface of a run: states at any time, error, balance and pictures."""
+"""Trajectory of a single run: states at its rows and between them, events, error, pictures."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arguments import Array, ByName
+from .arguments import Array
 from .atomic_write import File
+from .columns import ROWS_PER_STEP, Columns
 from .estimate import Estimate, estimate
-from .inputs import evaluate_law
-from .package import require_eomc, warn
-from .status import STATUS_MESSAGES, Interrupted, state_text
-from .trajectory_data import Trajectory, infinite_at_start
+from .interfaces import CompiledModel
+from .package import option, require_eomc, warn
+from .requests import Request, count_steps, evaluate_law, split_times
+from .saved import NOT_STORED
+from .status import STATUS_MESSAGES, Interrupted, MotionError, state_text
 
 if TYPE_CHECKING:  # modules that analyse and draw runs are imported when they are used
     from .balance import Balance
 
-NOISE = (
-    "estimate: u gives other values at the start than it gave in the run, as noise does, or what "
-    "has a state of its own: let it depend on t, q and qd alone"
-)
-
 
 @dataclass(eq=False, repr=False)
-class Run(Trajectory):
-    """A trajectory: the states at the rows of a simulation, and quantities that follow from them.
+class Trajectory(Columns):
+    """Trajectory of one run: the states at its rows, and quantities that follow from them.
 
-    Columns are read by name as well: run["theta_dot"].
+    A row consists of a time, the positions q and the velocities qd. There is a row after each step,
+    after every n-th step, or at each requested time. With events there are two rows at each state
+    jump, before and after it, and a fixed step that reaches a state jump ends there; the next step
+    is shorter and leads to the next multiple of the step size h. Columns are read by name as well:
+    run["theta_dot"]. The names of SciPy's solve_ivp are understood: success, message, t, sol, nfev,
+    t_events and y_events.
 
     Attributes
     ----------
@@ -43,37 +46,272 @@ class Run(Trajectory):
     energy : (n,) array
         K + P, J, computed at the first access.
     status : str
-        "ok", "singular", "not finite", "no convergence", with constraints "locked", or
-        "interrupted". A run with another status than "ok" ends with its last valid state.
+        "ok", "singular", "not finite", "no convergence", with constraints "locked", with events
+        "accumulated", "out of memory", or "interrupted". A run with another status than "ok" ends
+        with its last valid state.
+    success : bool
+        True if the status is "ok".
     message : str
         The outcome; if the run stopped, the time and the reason.
-    h, method, steps, every : float, str, int, int
-        Step size, s, method and number of completed steps; there is a row after each `every` steps.
-    evaluations : int
+    sol : callable
+        sol(t) is the state [q; qd] at a time or at times, (2 nq,) or (2 nq, n).
+    nfev, evaluations : int
         Number of evaluations of accelerations.
+    t_events, y_events : list of arrays
+        Times (m,), s, and states [q; qd] (m, 2 nq) of the occurrences of each event.
+    events : dict of EventLog
+        Times t (m,) and states q, qd (m, nq) of the occurrences of each event, by the event's name.
+    h, method, steps, every : float, str, int, int
+        Size of fixed steps or mean size of adaptive steps, s, method and number of completed steps;
+        with fixed steps and without requested times there is a row after each `every` steps.
+    tol : float
+        Tolerance of adaptive steps; 0 for fixed steps.
+    rejected, stiff_steps : int
+        Number of rejected steps, and of steps that were solved by Newton's method because the
+        motion is stiff.
+    reached : float
+        Time that the run reached, s.
+    stopped : str
+        Name of the event that ended the run, or "".
+    limit : float
+        Time at which events accumulate (Zeno behaviour), s; nan unless the status is "accumulated".
+    singular_steps : int
+        Number of steps that end at a singular position, where a constraint equation depends on the
+        others. Its multiplier is large or 0 there, and joint forces are not unique. The motion is
+        correct nevertheless.
+    first_singular : float
+        End time of the first of these steps, s; nan if there is none.
+    request : Request
+        The checked arguments with which the run was made.
     error : Estimate or None
         Error estimate, if `estimate` was called or requested.
 
     Notes
     -----
-    Runs are equal if their scenes, settings and rows are equal, bit by bit. A pickled run contains
-    all of these, its parameters and its inputs, except a u that is a function; `estimate` then
+    Runs are equal if their scenes, arguments except inputs, rows, events and counters are equal,
+    bit by bit. A pickled run contains all of these, except a u that is a function; `estimate` then
     raises ValueError. An unpickled run belongs to the build that pickled it. If that build no
     longer exists, it belongs to the present build, with a warning, if the columns have the same
     names.
     """
 
-    error: Estimate | None = field(default=None, init=False)
-
-    stopped = ""  # name of the event that ended the run
+    model: CompiledModel
+    request: Request
+    rows: Array | tuple[Array, Array]  # q and qd, in one array (2, n, nq) or two
+    steps: int
+    status: str
+    evaluations: int
+    # rarely used fields are set after construction, whose time dominates that of short runs
+    times: Array | None = field(default=None, init=False)  # None: multiples of `every` steps
+    end_time: float | None = field(default=None, init=False)  # None: that of `steps` steps
+    rejected: int = field(default=0, init=False)
+    stiff_steps: int = field(default=0, init=False)
+    # values of a function u, a row for each control period that began
+    period_inputs: Array | None = field(default=None, init=False, compare=False)
+    # event indices (m,), rows of t, q, qd
+    event_data: tuple[Array, Array] | None = field(default=None, init=False)
+    stopped: str = field(default="", init=False)
+    limit: float = field(default=float("nan"), init=False)
+    singular_steps: int = field(default=0, init=False)
+    first_singular: float = field(default=float("nan"), init=False)
+    error: Estimate | None = field(default=None, init=False, compare=False)
 
     @property
-    def events(self) -> Mapping[str, Any]:
-        """Occurrences of each event as an `EventLog`, by the event's name.
+    def x(self) -> Array:
+        """States [q; qd] at the rows, (n, 2 nq)."""
+        return np.concatenate([self.q, self.qd], axis=-1)
 
-        The mapping is empty for a scene without events.
+    @property
+    def h(self) -> float:
+        """Size of fixed steps, or mean size of adaptive steps, s."""
+        request = self.request
+        return request.h or float(self.reached - request.t0) / (self.steps or 1)
+
+    def evaluate(self, function: Callable[..., Any], *, has_inputs: bool = False) -> Array:
+        """Evaluate a function of the state, and of the inputs if it has them, at each row."""
+        inputs = {"u": self._row_inputs()} if has_inputs else {}
+        return np.asarray(function(self.q, self.qd, t=self.t, params=self.request.p, **inputs))
+
+    def _states(self, times: Array) -> Array:
+        request = self.request
+        if request.has_equal_steps and self.times is None:
+            return self._states_after_rows(times)
+        rows = np.empty((2, len(times), len(request.q)), self.model.info.dtype)
+        first = int(bool(len(times)) and times[0] <= request.t0)
+        rows[:, :first] = [[request.q], [request.qd]]
+        if len(times) > first:
+            rows[:, first:] = self.repeat(times[first:]).rows
+        return rows
+
+    def _states_after_rows(self, times: Array) -> Array:
+        """Return the states at times, by steps from the row before each."""
+        model, request = self.model, self._replayed_request()
+        rows, u = np.empty((2, len(times), model.info.nq), model.info.dtype), request.u
+        whole, rest = split_times(times, request.t0, request.h, self.steps)
+        for k, (n, left) in enumerate(zip(whole.tolist(), rest.tolist(), strict=True)):
+            row = min(n // request.every, len(self) - 1)
+            q, qd = self.q[row], self.qd[row]
+            for step in range(row * request.every, n + (left > 0)):
+                inputs = u
+                if u is not None and u.ndim == 2:
+                    inputs = u[min(step // request.hold, len(u) - 1)]
+                q, qd = model.integrator.step(
+                    q, qd, request.h if step < n else left, request.t0 + step * request.h, inputs,
+                    request.p, request.method,
+                )  # fmt: skip
+            rows[:, k] = q, qd
+        return rows
+
+    def _replayed_request(self) -> Request:
+        """Return the request with the stored inputs in place of a function of inputs."""
+        if isinstance(self.request.u, str) and self.request.u == NOT_STORED:
+            raise ValueError(NOT_STORED)
+        if self.period_inputs is None:
+            return self.request
+        return self.request.replace(u=self.period_inputs)
+
+    def repeat(self, times: Array | None, end: float | None = None) -> Trajectory:
+        """Repeat the run with rows at `times`, (n,), s, or after each step.
+
+        end: end time of steps of various sizes, s; by default that of the run. Without `times` such
+        runs have both rows of each jump. A function of inputs is not called again, as its values
+        are stored.
         """
-        return ByName("events", (), ())
+        request = self._replayed_request()
+        if not request.has_equal_steps:
+            times = None if times is None else times.astype(self.model.info.dtype)
+            request = request.replace(t_end=request.t_end if end is None else end)
+        elif times is None and self.status != "ok":
+            request = request.replace(steps=self.steps)
+        elif times is not None:
+            request = request.replace(steps=count_steps(times, request.t0, request.h))
+        request = request.replace(times=times, every=1)
+        run: Trajectory = self.model.integrator.integrate(request)
+        return run
+
+    def with_rows(self, times: Array, rows: Array) -> Trajectory:
+        """Return a copy of the run with other times (n,) and rows (2, n, nq)."""
+        run = copy(self)
+        run.times, run.rows = times, rows
+        return run
+
+    def rows_at(self, times: Array) -> Trajectory:
+        """Return a copy of the run with rows at `times`, (n,), s, instead of its own."""
+        return self.with_rows(times, np.array(self(times)))
+
+    def with_jump_rows(self) -> Trajectory:
+        """Return a run that has two rows at each state jump, one before and one after it.
+
+        A run with events whose rows are at requested times is repeated with a row after each step.
+        Any other run is returned unchanged.
+        """
+        if self.event_data is None or not len(self.event_data[0]) or (np.diff(self.t) == 0).any():
+            return self
+        return self.with_step_rows()
+
+    def with_step_rows(self) -> Trajectory:
+        """Return the run with a row after each step and both rows of each jump."""
+        return self.repeat(None, float(self.t[-1]) if self.status == "interrupted" else None)
+
+    @property
+    def curve_run(self) -> Trajectory:
+        """The run for plots, which has a thousand rows at least if its steps have various sizes."""
+        min_rows = 1_000
+        if self.request.has_equal_steps or not 2 <= len(self) < min_rows:
+            return self
+        return self.insert_rows(np.linspace(self.t[0], self.t[-1], min_rows + 1)[1:-1])
+
+    def resample(self, count: int) -> Trajectory:
+        """Interpolate the run at `count` equidistant times, with both rows of each jump."""
+        steps = self.with_jump_rows()
+        jumps = np.flatnonzero(np.diff(steps.t) == 0)
+        own = np.unique(np.concatenate([[0], jumps, jumps + 1, [len(steps) - 1]]))
+        times = np.linspace(steps.t[0], steps.t[-1], count)
+        times = times[~np.isin(times, steps.t[own])]
+        return steps.with_rows(steps.t[own], np.array([steps.q[own], steps.qd[own]])).insert_rows(
+            times
+        )
+
+    def insert_rows(self, times: Array) -> Trajectory:
+        """Return a copy of the run with additional rows at `times`."""
+        whole = np.concatenate([self.t, times])
+        order = np.argsort(whole, kind="stable")
+        both = zip((self.q, self.qd), self(times), strict=True)
+        return self.with_rows(whole[order], np.array([np.concatenate(x)[order] for x in both]))
+
+    def equidistant(self) -> Trajectory:
+        """Return a run with equidistant rows, one for each step, or enough for a picture."""
+        if self.request.has_equal_steps:
+            has_all = self.every == 1 and self.times is None
+            return self if has_all else self.repeat(None)
+        if (np.diff(self.t) == 0).any() or len(self) < 2:
+            return self
+        times = np.linspace(self.t[0], self.t[-1], ROWS_PER_STEP * (self.steps + 1))
+        return self.rows_at(times)
+
+    @property
+    def description(self) -> str:
+        """The choice of steps as text: numbers of rejected and Newton steps, or the step size."""
+        if not self.tol:
+            return f"h = {self.h:g} s"
+        stiff = f", {self.stiff_steps} by Newton's method" if self.stiff_steps else ""
+        return f"{self.rejected} rejected{stiff}, tolerance {self.tol:g}"
+
+    @property
+    def message(self) -> str:
+        """The outcome of the run as a sentence: number of steps, or time and reason of a stop."""
+        progress = f"{self.steps} steps of {self.h:g} s"
+        if self.tol:
+            progress = f"{self.steps} steps, {self.description}"
+        if self.status == "ok":
+            return progress
+        if self.status == "not finite" and self.stopped:
+            return f"event '{self.stopped}' jumps to no finite state at t = {self.t[-1]:.9g} s"
+        if self.status == "accumulated":
+            return (
+                f"jumps follow one another ever sooner, up to t = {self.limit:.15g} s: there the "
+                f"run ends, after {progress}"
+            )
+        why = _infinite_at_start(self) or failure_message(self.model, self.status, self.tol > 0)
+        where = state_text(self.q[-1], self.qd[-1]) if len(self) else ""
+        end = self.t[-1] if len(self) else self.t0
+        return f"stopped at t = {end:.9g} after {progress}, {where}: {why}"
+
+    @property
+    def broken_constraints(self) -> str:
+        """Return a message on a constraint that is violated at the end of the run, or ""."""
+        model, names = self.model, self.model.info.constraints.names
+        max_roundings, min_scale = 2.0**26, 1e-9  # of the terms of a constraint
+        # steps satisfy all other constraints
+        has_dependent = self.singular_steps or model.info.constraints.redundant
+        if not has_dependent or not len(self.q) or self.status != "ok":
+            return ""
+        q, qd, t, p = self.q[-1], self.qd[-1], float(self.t[-1]), self.request.p
+        sizes = np.abs(model.constraints.constraint_jacobian(q, t=t, params=p)).astype(float)
+        for what, x in (("constraints", q), ("constraint_rates", qd)):
+            off = np.abs(getattr(model.constraints, what)(q, qd, t, p)).astype(float)
+            share = off / np.maximum(sizes @ (np.abs(x) + np.max(np.abs(x))), min_scale)
+            worst = int(np.argmax(share))
+            if share[worst] > max_roundings * float(np.finfo(model.info.dtype).eps):
+                rate = "the rate of " if what != "constraints" else ""
+                return (
+                    f"{rate}{names[worst]} is {off[worst]:.3g} at the end, not 0: constraints "
+                    "contradict one another, and this motion does not obey them all"
+                )
+        return ""
+
+    @property
+    def remark(self) -> str:
+        """Warning for a run with status "ok": violated or dependent constraint equations; or ""."""
+        if broken := self.broken_constraints:
+            return broken
+        if not self.singular_steps:
+            return ""
+        many = "a step ends" if self.singular_steps == 1 else f"{self.singular_steps} steps end"
+        return (
+            f"{many} where a constraint depends on others, first at t = {self.first_singular:.9g}: "
+            "multipliers and reactions are not unique there"
+        )
 
     def balance(self) -> Balance | None:
         """Return the energy balance of the run, J, with the numerical error that follows from it.
@@ -91,7 +329,7 @@ class Run(Trajectory):
 
     def plot(
         self, *names: str, phase: Any = None, section: Mapping[str, Array] | None = None,
-        other: Run | Sequence[Run] = (), labels: Sequence[str] | None = None,
+        other: Trajectory | Sequence[Trajectory] = (), labels: Sequence[str] | None = None,
         wrap: bool | str | Sequence[str] = False, ax: Any = None, axes: Any = None,
         file: File | None = None, **style: Any,
     ) -> Any:  # fmt: skip
@@ -106,7 +344,7 @@ class Run(Trajectory):
             Phase portraits: a coordinate, drawn with its velocity on the y axis, or a pair (x, y).
         section : dict, optional
             Result of `section`, whose points are drawn in the portraits instead of curves.
-        other : Run or sequence of Run
+        other : Trajectory or sequence of Trajectory
             Runs that are drawn dashed in the same panels.
         labels : sequence of str, optional
             Names of the runs for the legend, that of this run first.
@@ -135,9 +373,9 @@ class Run(Trajectory):
         ValueError
             If the number of `axes` or `labels` does not fit.
         """
-        from .plot import plot
+        from .plot import Figure, plot
 
-        return plot(self, names, phase, section, other, labels, wrap, ax, axes, file, style)
+        return plot(self, names, Figure(wrap, ax, axes, file, style), phase, other, section, labels)
 
     def section(
         self, name: str, value: float = 0.0, *, rising: bool | None = None,
@@ -174,30 +412,22 @@ class Run(Trajectory):
         KeyError
             If the name is unknown.
         """
-        from .section import as_section
+        from .section import section
 
-        return self._crossings(name, *as_section(self._columns(), name, value, rising, period))
-
-    def _crossings(
-        self, name: str, value: float, rising: bool | None, period: float | None
-    ) -> dict[str, Array]:
-        from .section import crossings
-
-        return crossings(self.to_dict(), name, value, rising, period)
-
-    @property
-    def curve_run(self) -> Run:
-        """The run with rows close enough for curves."""
-        return self
+        return section(self, name, value, rising, period)
 
     def _repr_html_(self) -> str:
         """Return the summary of the run that notebooks display, as HTML."""
-        from .notebook import html
+        from .plot import html
 
         return html(self)
 
     def animate(
-        self, file: File | None = None, *others: Run, scene: Any = None, title: str | None = None
+        self,
+        file: File | None = None,
+        *others: Trajectory,
+        scene: Any = None,
+        title: str | None = None,
     ) -> Any:
         """Animate the motion as a page for browsers and notebooks, or as a film.
 
@@ -205,7 +435,7 @@ class Run(Trajectory):
         ----------
         file : str or path, optional
             File to write: a page .html, or a film .gif or .mp4, which needs matplotlib.
-        *others : Run
+        *others : Trajectory
             Runs that are shown beside this one.
         scene : path, optional
             The scene, if the module was not loaded by `eomc.load`.
@@ -277,46 +507,79 @@ class Run(Trajectory):
         Interrupted
             On Ctrl-C.
         """
-        self._repeated()
+        self._check_repeatable()
         try:
-            self.error = self._estimated(progress)
+            self.error = estimate(self, progress)
         except KeyboardInterrupt:
             raise Interrupted(self) from None
         if words := self.error.warning:
             warn(f"{self.model.info.name}: {words}")
         return self.error
 
-    def _repeated(self) -> None:
-        """Raise ValueError if the run cannot be repeated."""
-        if isinstance(self.input_source, str):
-            raise ValueError(f"estimate: {self.input_source}")
-        if (
-            callable(self.input_source)
-            and self.applied_inputs is not None
-            and len(self)
-            and self.t[0] == self.t0
-        ):
+    def _check_repeatable(self) -> None:
+        """Raise ValueError if the run cannot be repeated with the inputs that it had."""
+        request, values = self.request, self.period_inputs
+        if isinstance(request.u, str):
+            raise ValueError(f"estimate: {request.u}")
+        if callable(request.u) and values is not None and len(values):
             u_at_start = evaluate_law(
-                self.input_source, self.model.arguments.inputs, self.t0, self.q[0], self.qd[0]
+                request.u, self.model.arguments.inputs, self.t0, request.q, request.qd
             )
-            if not np.array_equal(u_at_start, self.applied_inputs[0]):
-                raise ValueError(NOISE)
+            if not np.array_equal(u_at_start, values[0]):
+                raise ValueError(
+                    "estimate: u gives other values at the start than it gave in the run, as noise "
+                    "does, or what has a state of its own: let it depend on t, q and qd alone"
+                )
 
-    def _estimated(self, progress: Callable[[int, int], None] | None) -> Estimate:
-        return estimate(self, progress)
+    def __len__(self) -> int:
+        return len(self.q)
 
-    @property
-    def message(self) -> str:
-        """The outcome of the run as a sentence: number of steps, or time and reason of a stop."""
-        if self.status == "ok":
-            return f"{self.steps} steps of {self.h:g} s"
-        reason = infinite_at_start(self) or STATUS_MESSAGES[self.status]
-        return (
-            f"stopped at t = {self.t[-1]:.9g} after {self.steps} steps of {self.h:g} s, "
-            f"{state_text(self.q[-1], self.qd[-1])}: {reason}"
+    def __repr__(self) -> str:
+        how = "" if self.status == "ok" else f"{self.status} after "
+        steps = f", tolerance {self.tol:g}" if self.tol else f" of {self.h:g} s"
+        return f"<Trajectory of {self.model.info.name}: {how}{self.steps} steps{steps}>"
+
+
+def failure_message(model: CompiledModel, status: str, is_adaptive: bool) -> str:
+    """Return a sentence with the reason why a run ended with this status, and with a remedy.
+
+    status: such as "singular". is_adaptive: whether its steps are adaptive.
+    """
+    if status != "no convergence" or not is_adaptive:
+        return STATUS_MESSAGES[status]
+    remedy = "take " + option("friction", '"stick"')
+    if model.info.constraints.modes:  # the scene has it for another coordinate
+        remedy = "give its coordinate friction = in place of the force"
+    return (
+        "no step is short enough to go on: forces grow without end there, as in a fall into a "
+        f"centre, or keep jumping: for friction by sign(x_dot) that sticks {remedy}, or let events "
+        "switch it; else a looser tolerance"
+    )
+
+
+def _infinite_at_start(run: Trajectory) -> str:
+    """Return a sentence that names the quantity that is not finite at the initial state of a run.
+
+    The quantity is the potential energy, the kinetic energy or an acceleration. Return "" if all
+    accelerations are finite there or cannot be computed, or if the run made a step.
+    """
+    if run.status != "not finite" or run.steps or not len(run):
+        return ""
+    model, q, qd, inputs = run.model, run.q[0], run.qd[0], run.request.u
+    at: dict[str, Any] = {"t": run.t0, "params": run.request.p}
+    try:
+        model.functions.acceleration(
+            q, qd, u=None if inputs is None or not model.info.nu else run.u[0], **at
         )
-
-    @property
-    def remark(self) -> str:
-        """Warning for a run with status "ok", or ""."""
-        return self._singular
+        return ""
+    except MotionError as lacking:
+        if lacking.status != "not finite":
+            return ""
+    except ValueError:  # the inputs of a saved run are unknown
+        return ""
+    what = "an acceleration"
+    if not np.isfinite(model.functions.potential_energy(q, **at)):
+        what = "the potential energy"
+    elif not np.isfinite(model.functions.kinetic_energy(q, qd, **at)):
+        what = "the kinetic energy"
+    return f"{what} is not finite at the start: start elsewhere"

@@ -16,10 +16,12 @@ import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from eomc.base import names, texts
+from eomc.runtime import mathematics
+from eomc.scene import hints
 
 MAX_LENGTH = 10_000
 MAX_DEPTH = 150
@@ -28,14 +30,10 @@ MAX_DIGITS = 1_000  # of a literal
 MAX_CANDIDATES = 1_000  # names that are compared for similarity
 MAX_LOG10 = 300  # numbers in a formula, folded or written, must be below 1e300
 
-# functions with the same name in Python's math, SymPy and C
-ELEMENTARY = "sin cos tan asin acos atan sinh cosh tanh exp log sqrt atan2".split()
 # name -> (fewest, most) arguments
 FUNCTIONS: Mapping[str, tuple[int, int]] = {
-    **dict.fromkeys((*ELEMENTARY[:-1], "abs", "sign", "heaviside", "dot"), (1, 1)),
-    "atan2": (2, 2),
-    "min": (2, 32),
-    "max": (2, 32),
+    **{f.name: f.argument_counts for f in mathematics.FUNCTIONS.values()},
+    "dot": (1, 1),
 }
 
 _OPERATORS: Mapping[type, Callable[..., Any]] = {
@@ -46,64 +44,6 @@ _OPERATORS: Mapping[type, Callable[..., Any]] = {
     ast.Pow: operator.pow,
     ast.UAdd: operator.pos,
     ast.USub: operator.neg,
-}
-
-# remedies for what newcomers write: characters, then functions, then syntax
-_QUOTE = "quotes and primes are not used here: write {}_dot for a velocity, dot(e) for de/dt"
-_ORDER = "comparisons are not used in formulas: write heaviside(a - b), min or max"
-_CHARACTER_REMEDIES: Mapping[str, str] = {
-    **dict.fromkeys("'\"`", _QUOTE),
-    **dict.fromkeys("<>", _ORDER),
-    **dict.fromkeys(
-        "\\\b\f\v\a\r", "LaTeX is not read: write names without backslash (theta), powers as **"
-    ),
-    **dict.fromkeys("[{", "lists and indices are not used: give each quantity a name of its own"),
-    "^": "'^' is not a power here: write '**'",
-    "=": "'=' is not used inside a formula: write only what stands right of it",
-    "°": "angles are in radians: write 90 degrees as 90*pi/180",
-    "#": "a comment can't stand inside a formula: put it after the closing quotes",
-    "%": "'%' is not used in formulas: comments stand after the closing quotes, with '#'",
-    **{c: f"'{c}' is not ASCII: write {names.plain(c)}" for c in names.GREEK},
-    "π": "'π' is not ASCII: write pi",
-    **dict.fromkeys("·×⋅∙", "products are written with '*'"),
-    **dict.fromkeys("−–—", "this dash is not a minus sign: write '-'"),
-    **dict.fromkeys("′’‘″“”", _QUOTE),
-    **{c: f"'{c}' is not ASCII: write **{n}" for n, c in enumerate("⁰¹²³⁴⁵⁶⁷⁸⁹")},
-    "|": "bars are not used here: write abs(...)",
-    "½": "'½' is not ASCII: write 1/2",
-    "√": "'√' is not ASCII: write sqrt(...)",
-}
-
-_FUNCTION_ALIASES: Mapping[str, str] = {
-    **{f"arc{f}": f"a{f}" for f in ("sin", "cos", "tan", "tan2")},
-    **{f.capitalize(): f for f in FUNCTIONS},
-    **{"ln": "log", "fabs": "abs", "sgn": "sign", "sine": "sin", "cosine": "cos"},
-    **{"Heaviside": "heaviside", "step": "heaviside", "tangent": "tan", "Derivative": "dot"},
-    **{"diff": "dot", "derivative": "dot", "ddt": "dot", "arctg": "atan", "tg": "tan"},
-}
-
-_SYNTAX_REMEDIES: Mapping[type, str] = {
-    ast.FloorDiv: "'//' is not used in formulas: write '/'",
-    ast.IfExp: "'if' is not used in formulas: write heaviside(a - b), min or max",
-    ast.BoolOp: "'and' and 'or' are not used in formulas: write heaviside, min or max",
-    ast.Compare: _ORDER,
-    ast.Attribute: "'.' is not used in formulas: names are plain, velocities end in _dot",
-    ast.Lambda: "'lambda' is not used in formulas",
-}
-
-_NO_FORM = "it has no exact form in the functions of formulas"
-NOT_ELEMENTARY: Mapping[str, str] = {
-    "erf": f"{_NO_FORM}; the force -2*exp(-x**2)/sqrt(pi) of a potential erf(x) has one: [forces]",
-    "erfc": f"{_NO_FORM}; the force 2*exp(-x**2)/sqrt(pi) of a potential erfc(x) has one: [forces]",
-    "gamma": _NO_FORM,
-}
-_FUNCTION_REMEDIES: Mapping[str, str] = {
-    **NOT_ELEMENTARY,
-    "pow": "write a**b",
-    **dict.fromkeys(("radians", "deg2rad", "deg", "degrees"), "write 30 degrees as 30*pi/180"),
-    **{name: f"write 1/{of}(...)" for name, of in (("sec", "cos"), ("csc", "sin"), ("cot", "tan"))},
-    "cbrt": "write x**(1/3) where x is positive",
-    "Piecewise": "write heaviside(a - b), min or max",
 }
 
 _ALLOWED = "numbers, names, + - * / **, parentheses and functions"
@@ -130,10 +70,15 @@ class Formula:
     """A formula that contains only permitted syntax.
 
     text: the formula as written. tree: its Python syntax tree, which must not be changed.
+    expression: the SymPy expression, if System.make was given one; `text` is then a print of it.
     """
 
     text: str
     tree: ast.expr
+    expression: Any = None
+
+    def __str__(self) -> str:
+        return self.text
 
     @property
     def shown(self) -> str:
@@ -155,6 +100,9 @@ class Formula:
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
                 if node.func.id in functions:
                     yield node
+
+
+Value = float | str | Formula  # an entry of a scene: a number, the text of a formula, a formula
 
 
 def nearest(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
@@ -197,7 +145,7 @@ def parse(text: str) -> Formula:
     if not line:
         raise FormulaError("the formula is empty: write 0 if nothing is meant")
     for at, c in enumerate(line):
-        if c in _CHARACTER_REMEDIES:
+        if c in hints.CHARACTERS:
             raise _character_error(line, at)
         if not " " <= c <= "~":
             raise FormulaError(f"'{c}' is not used in formulas: only {_ALLOWED}", at)
@@ -227,7 +175,7 @@ def _character_error(line: str, at: int) -> FormulaError:
     if power and name in FUNCTIONS:
         message = f"write powers behind the function: {name}(...)**{power[1]}"
         return FormulaError(message, at - len(name), len(name) + 2)
-    return FormulaError(_CHARACTER_REMEDIES[line[at]].format(name), at)
+    return FormulaError(hints.CHARACTERS[line[at]].format(name), at)
 
 
 # 2m, then m g, then )m
@@ -317,7 +265,7 @@ def _check(formula: Formula, node: ast.expr, depth: int, power: float = 1) -> No
         case ast.Call(func=ast.Attribute(attr=name) as func) if name in FUNCTIONS:
             raise _fault(func, f"functions stand by themselves: write {name}(...)")
         case ast.Call(func=ast.Attribute() | ast.Lambda() as func):
-            raise _fault(func, _SYNTAX_REMEDIES[type(func)])
+            raise _fault(func, hints.SYNTAX[type(func)])
         case ast.Call(func=func) if not isinstance(func, ast.Name):
             raise _fault(func, "write products with '*': a parenthesis follows without one")
         case ast.Tuple(elts=[first, *_]):
@@ -327,24 +275,24 @@ def _check(formula: Formula, node: ast.expr, depth: int, power: float = 1) -> No
             )
         case _:
             kinds = (type(node), type(getattr(node, "op", None)))
-            remedy = next((_SYNTAX_REMEDIES[k] for k in kinds if k in _SYNTAX_REMEDIES), None)
+            remedy = next((hints.SYNTAX[k] for k in kinds if k in hints.SYNTAX), None)
             raise _fault(node, remedy or f"only {_ALLOWED} are used here")
+
+
+def unknown_function(name: str) -> str:
+    """Return the message, with a remedy, for the name of a function that formulas do not have."""
+    if name in hints.FUNCTIONS:
+        return f"'{name}' is not used in formulas: {hints.FUNCTIONS[name]}"
+    alias = hints.FUNCTION_ALIASES.get(name)
+    near = f"; did you mean '{alias}'?" if alias else suggest(name, FUNCTIONS)
+    known = f": write {texts.line(name)}*(...) for a product; functions are {', '.join(FUNCTIONS)}"
+    return f"'{name}' is not a function{near or known}"
 
 
 def _check_call(func: ast.Name, call: ast.Call) -> None:
     name, argument_count = func.id, len(call.args)
-    if name in _FUNCTION_REMEDIES:
-        raise _fault(func, f"'{name}' is not used in formulas: {_FUNCTION_REMEDIES[name]}")
     if name not in FUNCTIONS:
-        near = _FUNCTION_ALIASES.get(name)
-        raise _fault(
-            func,
-            f"'{name}' is not a function"
-            + (
-                (f"; did you mean '{texts.line(near)}'?" if near else suggest(name, FUNCTIONS))
-                or f": write {name}*(...) for a product; functions are {', '.join(FUNCTIONS)}"
-            ),
-        )
+        raise _fault(func, unknown_function(name))
     minimum, maximum = FUNCTIONS[name]
     if not minimum <= argument_count <= maximum:
         count = str(minimum) if minimum == maximum else f"{minimum} to {maximum}"
@@ -368,7 +316,8 @@ def _exponent_product(node: ast.expr, exponent: float, power: float) -> float:
 def _check_value(formula: Formula, node: ast.expr) -> None:
     value = _number(formula, node)
     if value is not None and not abs(value) < math.inf:
-        raise _fault(node, "has no real, finite value")
+        why = domain_advice(replace(formula, tree=node), dict[str, Any]().__getitem__)
+        raise _fault(node, f"has no real, finite value{why}")
 
 
 def _number(formula: Formula, node: ast.expr) -> float | None:
@@ -392,6 +341,21 @@ def evaluate(formula: Formula, algebra: Mapping[str, Any], lookup: Callable[[str
     are not caught.
     """
     return _walk(formula, formula.tree, algebra, lookup)
+
+
+def domain_advice(formula: Formula, lookup: Callable[[str], Any]) -> str:
+    """Return ": log(x) is real where x > 0" if a function is evaluated outside its domain, or "".
+
+    lookup: function that returns the value of a name.
+    """
+    advice = ""
+    for call in formula.calls(*(f.name for f in mathematics.ANALYTIC if f.domain)):
+        f = mathematics.FUNCTIONS[ast.unparse(call.func)]
+        try:
+            _walk(formula, call, _CONSTANT_ALGEBRA, lookup)
+        except (ArithmeticError, ValueError, TypeError, KeyError):  # inner calls come last
+            advice = f": {f.name}({', '.join(f.arguments)}) is real where {f.domain}"
+    return advice
 
 
 def fold_values(formula: Formula, values: Mapping[str, float]) -> str:
@@ -437,14 +401,5 @@ def _literal(text: str) -> float:
     return float(int(text, 0)) if text[:2] in ("0x", "0o", "0b") else float(text)
 
 
-NUMERIC: Mapping[str, Any] = {
-    "number": _literal,
-    "pi": math.pi,
-    **{name: getattr(math, name) for name in ELEMENTARY},
-    "abs": abs,
-    "sign": lambda x: float((x > 0) - (x < 0)),
-    "heaviside": lambda x: 0.5 * ((x > 0) - (x < 0)) + 0.5,
-    "min": min,
-    "max": max,
-}
+NUMERIC: Mapping[str, Any] = {"number": _literal, "pi": math.pi, **mathematics.DOUBLES}
 _CONSTANT_ALGEBRA = {**NUMERIC, "dot": lambda _: 0.0}  # numbers have no rate

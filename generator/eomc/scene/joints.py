@@ -1,17 +1,39 @@
 """Tables of joints: the motions of each kind, and the constraints of each kind that closes a loop.
 
-A joint is a sequence of elementary motions, rotations and translations, each about or along an axis
-of the frame that the previous ones have moved. A kind of joint made of these is one entry here.
+A joint is a sequence of elementary motions, each about and along an axis of the frame that the
+previous ones have moved. A kind of joint made of these is one entry here. Each elementary motion is
+given by its motion subspace S (Featherstone, *Rigid Body Dynamics Algorithms*, ch. 4).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 Axis = tuple[float, float, float]
 
 X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+
+
+class MotionSubspace(NamedTuple):
+    """The motion subspace S = (angular e, linear e) of an elementary motion along an axis e.
+
+    A rate s of its coordinate turns the moving frame at the angular velocity `angular` e s, and
+    moves its origin at the velocity `linear` e s.
+    """
+
+    axis: Axis
+    angular: int
+    linear: Any
+
+
+# (angular, linear) of each elementary motion; None stands for the pitch of the joint
+ELEMENTARY_MOTIONS: dict[str, tuple[int, int | None]] = {
+    "r": (1, 0),  # rotation
+    "t": (0, 1),  # translation
+    "h": (1, None),  # screw (helical): rotation, and pitch times the angle along the axis
+}
 
 
 @dataclass(frozen=True)
@@ -21,8 +43,8 @@ class Joint:
     Attributes
     ----------
     motions
-        A letter for each motion, "r" for a rotation or "t" for a translation, in the order of the
-        coordinates in the scene.
+        A letter for each motion, a key of ELEMENTARY_MOTIONS, in the order of the coordinates in
+        the scene.
     axes
         The axis of each motion: a fixed vector, or an index (0 or 1) into the axes that the scene
         gives for the joint.
@@ -48,13 +70,23 @@ class Joint:
         """Number of axes that a scene can give for the joint: 0, 1 or 2."""
         return max((axis + 1 for axis in self.axes if isinstance(axis, int)), default=0)
 
-    def motion_axes(self, scene_axes: Sequence[Axis]) -> tuple[Axis, ...]:
-        """Return the axis of each elementary motion of the joint.
+    @property
+    def has_pitch(self) -> bool:
+        """Whether a scene gives a pitch for the joint."""
+        return any(ELEMENTARY_MOTIONS[motion][1] is None for motion in self.motions)
+
+    def subspaces(self, scene_axes: Sequence[Axis], pitch: Any) -> tuple[MotionSubspace, ...]:
+        """Return the motion subspace of each elementary motion of the joint.
 
         scene_axes: the axes that the scene gives for the joint; if empty, `defaults` is used.
+        pitch: value or formula of the pitch in m/rad, for a joint that has one.
         """
         chosen = scene_axes or self.defaults
-        return tuple(chosen[a] if isinstance(a, int) else a for a in self.axes)
+        pairs = zip(self.motions, self.axes, strict=True)
+        motions = (
+            (chosen[a] if isinstance(a, int) else a, *ELEMENTARY_MOTIONS[m]) for m, a in pairs
+        )
+        return tuple(MotionSubspace(e, w, pitch if v is None else v) for e, w, v in motions)
 
 
 JOINTS = {
@@ -69,6 +101,7 @@ JOINTS = {
         "ttr", (X, Y, Z), plane=True, order="along x, along y and about z", aliases=("plane",)
     ),
     "cylindrical": Joint("tr", (0, 0), (Z,), order="along the axis and about it"),
+    "screw": Joint("h", (0,), (Z,), aliases=("helical", "leadscrew", "ballscrew")),
     "universal": Joint("rr", (0, 1), (X, Y), order="about each axis", aliases=("cardan", "hooke")),
     # yaw, pitch, roll: singular at a pitch of pi/2
     "spherical": Joint("rrr", (Z, Y, X), order="about z, then y, then x", aliases=("ball",)),
@@ -141,7 +174,3 @@ REACTIONS = {
     True: ("force_x", "force_y", "moment"),
     False: ("force_x", "force_y", "force_z", "moment_x", "moment_y", "moment_z"),
 }
-
-CLOSING_ALIASES = {other: kind for kind, joint in CLOSINGS.items() for other in joint.aliases}
-
-JOINT_ALIASES = {other: kind for kind, joint in JOINTS.items() for other in joint.aliases}

@@ -4,26 +4,26 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
-
-import pydantic
 
 from eomc.base import names, texts
 from eomc.base.errors import EomcError, SceneError
 from eomc.scene import (
     formulas,
-    messages,
+    hints,
     repeat,
     schema,
     toml_text,
     validate_bodies,
     validate_tables,
 )
-from eomc.scene.formulas import Formula, suggest
-from eomc.scene.scene import Quantity, RunSettings, Scene, SceneInput, SceneOutput
+from eomc.scene.formulas import Formula, Value, suggest
+from eomc.scene.scene import NamedFormula, Quantity, Scene, SceneInput
+from eomc.scene.schema import RunSettings
 from eomc.scene.scope import (
     INPUT,
     NOTHING,
@@ -35,10 +35,8 @@ from eomc.scene.scope import (
     cycle_text,
     find_cycles,
 )
-from eomc.scene.source_map import SourceMap
-from eomc.scene.toml_text import MAX_BYTES
-
-_NOT_SI = "mm cm km g gram ms min rpm inch ft lb lbs".split()
+from eomc.scene.toml_text import MAX_BYTES, SourceMap
+from eomc.scene.validate_tables import ValueChecker
 
 
 def read(file: str | os.PathLike[str], parameters: Mapping[str, float] | None = None) -> Scene:
@@ -67,11 +65,9 @@ def read(file: str | os.PathLike[str], parameters: Mapping[str, float] | None = 
             data = stream.read(MAX_BYTES + 1)
     except FileNotFoundError:
         others = (p.name for p in path.parent.glob("*.toml") if p.name != "pyproject.toml")
-        intended = messages.intended_file(path)
+        intended = hints.intended_file(path)
         near = (
-            f"; did you mean '{texts.line(intended)}'?"
-            if intended
-            else messages.shipped_remedy(path)
+            f"; did you mean '{texts.line(intended)}'?" if intended else hints.shipped_remedy(path)
         )
         near = near or suggest(path.name, others)
         raise EomcError(f"{shown}: there is no such file{near}") from None
@@ -98,16 +94,16 @@ def parse(
     return check.scene(hashlib.sha256(data).hexdigest())
 
 
-def check_tree(tree: dict[str, Any], name: str) -> Scene:
+def check_tree(tree: dict[str, Any], places: SourceMap) -> Scene:
     """Check a scene that is given as a tree of dicts and lists, and return the checked scene.
 
-    tree: as TOML text would be parsed; it may be changed. name: name of the scene in messages.
-    Raises SceneError with all errors in the scene, without line numbers.
+    tree: as TOML text would be parsed, or with instances of Formula; it may be changed. places:
+    places of errors. Raises SceneError with all errors in the scene.
     """
-    return _SceneChecker(tree, SourceMap("", name), {}).scene("")
+    return _SceneChecker(tree, places, {}).scene("")
 
 
-class _SceneChecker(Checker):
+class _SceneChecker(ValueChecker):
     """Checks one scene, and collects all errors."""
 
     def __init__(
@@ -119,7 +115,7 @@ class _SceneChecker(Checker):
         if not repeat.expand(tree, self):
             raise SceneError(self.problems)
         self.bodies = bool(tree.get("body"))
-        self.doc = self._document(tree)
+        self.doc = schema.read(tree, self)
         self.tables = self._names()
 
     def scene(self, digest: str) -> Scene:
@@ -137,20 +133,18 @@ class _SceneChecker(Checker):
         }
         self.centers = validate_bodies.center_names(doc)
         self.kinds |= dict.fromkeys(self.centers - {*self.tables}, frozenset({POSITION}))
-        known: dict[str, float] = {}
-        constants = self._quantities("constants", known)
-        parameters = self._quantities("parameters", known)
-        coordinates = list(validate_tables.check_coordinates(self, doc, known))
+        constants, parameters = self._quantities("constants"), self._quantities("parameters")
+        coordinates = list(validate_tables.check_coordinates(self))
         self._definitions()
-        inputs = self._inputs(known)
+        inputs = self._inputs()
         energies = {key: self._energy(key) for key in ("kinetic", "potential", "dissipation")}
         forces = self._forces()
-        assembly = validate_bodies.assemble(self, doc, known)
-        events = list(validate_tables.check_events(self, doc))
-        constraints = list(validate_tables.check_constraints(self, doc))
-        validate_tables.check_guesses(self, doc)
+        assembly = validate_bodies.assemble(self)
+        events = list(validate_tables.check_events(self))
+        constraints = list(validate_tables.check_constraints(self))
+        validate_tables.check_guesses(self)
         run = self._run()
-        picture = validate_tables.check_picture(self, doc, known)
+        picture = validate_tables.check_picture(self)
         outputs = self._outputs(validate_tables.force_names(doc, assembly))
         self._check_requests()
         self._warn_unused()
@@ -181,14 +175,12 @@ class _SceneChecker(Checker):
         )
 
     def _run(self) -> RunSettings:
-        """Return the settings of a run; events and the method "auto" require adaptive steps."""
-        settings = self.doc.run.model_dump()
-        single = settings["real"] == "float"
-        sticks, auto = settings["friction"] == "stick", "auto" in settings["methods"]
-        settings["methods"] = tuple(m for m in settings["methods"] if m != "auto") or ("rk4",)
-        if (self.doc.event or sticks or auto) and settings["tolerance"] is None:
-            settings["tolerance"] = schema.DEFAULT_TOLERANCE[settings["real"]]
-        if single and (settings["tolerance"] or 1) < schema.MIN_FLOAT_TOLERANCE:
+        """Return the settings of a run; the method "auto" requires adaptive steps."""
+        settings = self.doc.run
+        sticks, tolerance = settings.friction == "stick", settings.tolerance
+        if "auto" in settings.methods and tolerance is None:
+            tolerance = schema.DEFAULT_TOLERANCE[settings.real]
+        if settings.real == "float" and (tolerance or 1) < schema.MIN_FLOAT_TOLERANCE:
             least = schema.MIN_FLOAT_TOLERANCE
             why = f'a float can keep {least:g} at best: take that, or real = "double"'
             self.report(("run", "tolerance"), why)
@@ -198,76 +190,29 @@ class _SceneChecker(Checker):
             why = "there is no friction: add it to a [[body]] with a joint, or to a coordinate"
             self.report(("run", "friction"), why)
         for key in ("linearize", "discretize"):
-            if sticks and settings[key]:
+            if sticks and getattr(settings, key):
                 why = 'friction that sticks has no derivatives: take friction = "smooth" for that'
                 self.report(("run", key), why)
-        return RunSettings(**settings)
+        methods = tuple(m for m in settings.methods if m != "auto") or ("rk4",)
+        return replace(settings, methods=methods, tolerance=tolerance)
 
     # document and names
-
-    def _document(self, tree: dict[str, Any]) -> schema.Document:
-        """Return the document; faulty entries are reported, then removed or replaced."""
-        for _ in range(100):
-            try:
-                return schema.read(tree)
-            except pydantic.ValidationError as fault:
-                errors = fault.errors()
-            # misspelt keys first: what is missing may only be misspelt
-            errors.sort(key=lambda error: error["type"] != "extra_forbidden")
-            reported: set[tuple[str, ...]] = set()
-            for error in errors:
-                path = schema.error_path(error)
-                if path in reported or (
-                    error["type"] == "missing" and schema.has_entry(tree, path)
-                ):
-                    continue
-                reported.add(path)
-                self.report(path, schema.explain(error, path))
-                if error["type"] == "extra_forbidden":
-                    self._replace_misspelt_key(tree, path)
-                else:
-                    self.repaired.add(path)
-                    schema.repair(tree, path)
-            if ("coordinates",) in self.repaired:
-                break  # everything else depends on them
-        raise SceneError(self.problems)
-
-    def _replace_misspelt_key(self, tree: dict[str, Any], path: tuple[str, ...]) -> None:
-        """Replace an unknown key by the intended one, or remove it."""
-        table = schema.table_at(tree, path[:-1])
-        value = table.pop(path[-1])
-        intended = schema.intended_key(path)
-        if intended and intended not in table:
-            table[intended] = value
-            self.places.rename(path, (*path[:-1], intended))
-        elif isinstance(value, dict):
-            self.kinds |= dict.fromkeys(value, frozenset({UNKNOWN}))
 
     def _names(self) -> dict[str, str]:
         """Return the table of every declared name."""
         doc = self.doc
         if why := names.module_fault(doc.name):
             self.report(("name",), why, text=doc.name)
+        taken = {f"{name}_dot": f"is the velocity of '{name}'" for name in doc.coordinates}
         tables_by_name: dict[str, str] = {}
         for table in ("coordinates", "parameters", "constants", "inputs", "definitions"):
             for name in getattr(doc, table):
-                if why := names.fault(name):
-                    self.report((table, name), why)
-                elif name in tables_by_name:
-                    self.report(
-                        (table, name),
-                        f"'{name}' stands in [{tables_by_name[name]}] already: "
-                        "rename one of the two",
-                    )
+                self.claim((table, name), name, taken, f"stands in [{table}] already")
                 tables_by_name.setdefault(name, table)
-        for name in doc.coordinates:
-            velocity = f"{name}_dot"
-            if velocity in tables_by_name:
-                self.report(
-                    (tables_by_name[velocity], velocity),
-                    f"'{velocity}' is the velocity of coordinate '{name}': choose another name",
-                )
-        self._output_names(tables_by_name)
+        columns = {n: t for n, t in tables_by_name.items() if t not in ("constants", "definitions")}
+        taken = validate_tables.names_in_use(doc, columns)
+        for name in doc.outputs:
+            self.claim(("outputs", name), name, taken, "stands in [outputs] already")
         for table in ("coordinates", "parameters", "constants", "inputs", "constraints"):
             for name, entry in getattr(doc, table).items():
                 self._unit((table, name), entry.unit, getattr(entry, "start", 0))
@@ -278,37 +223,18 @@ class _SceneChecker(Checker):
                 self._unit(("outputs", name), output.unit, formula=formula)
         return tables_by_name
 
-    def _output_names(self, tables_by_name: Mapping[str, str]) -> None:
-        """Report output names that are in use: outputs are columns beside all other quantities."""
-        columns = {
-            n: f"in [{t}]" for n, t in tables_by_name.items() if t in ("coordinates", "inputs")
-        }
-        columns |= {n: "a parameter" for n, t in tables_by_name.items() if t == "parameters"}
-        columns |= {f"{c}_dot": f"the velocity of '{c}'" for c in self.doc.coordinates}
-        columns |= {"t": "the time", "energy": "K + P"}
-        for name in self.doc.outputs:
-            if name in columns:
-                message = f"'{name}' is {columns[name]} already: give the output a name of its own"
-                self.report(("outputs", name), message)
-            elif why := names.fault(name):
-                self.report(("outputs", name), why)
-
-    def _unit(
-        self, path: tuple[str, ...], unit: str, start: float | str = 0, formula: str = ""
-    ) -> None:
+    def _unit(self, path: tuple[str, ...], unit: str, start: Value = 0, formula: str = "") -> None:
         """Report a unit that suggests a conversion: units are text, nothing is converted.
 
         `formula` is the coordinate or velocity that an output consists of.
         """
         plain = unit.strip().lower()
-        if messages.is_in_degrees(unit):
+        if hints.is_in_degrees(unit):
             number = f"{start:g}" if isinstance(start, float) and start else "30"
-            remedy = (
-                f'write {number} degrees as {messages.degrees_formula(number)}, with unit = "rad"'
-            )
+            remedy = f'write {number} degrees as {hints.degrees_formula(number)}, with unit = "rad"'
             remedy = f'write formula = "{formula}*180/pi"' if formula else remedy
             self.report((*path, "unit"), f"angles are in radians, nothing is converted: {remedy}")
-        elif plain in _NOT_SI:
+        elif plain in hints.NOT_SI:
             message = (
                 f"'{unit}' is not an SI unit: numbers are taken as they stand, none is converted"
             )
@@ -316,16 +242,15 @@ class _SceneChecker(Checker):
 
     # tables
 
-    def _quantities(self, table: str, known: dict[str, float]) -> list[Quantity]:
+    def _quantities(self, table: str) -> list[Quantity]:
         """Check constants (over earlier ones) or parameters (over constants); extends `known`."""
-        allowed, rule = {
-            "constants": (known, "a constant is made of numbers and of constants above it"),
-            "parameters": (
-                list(known),
-                "a parameter's value is made of numbers and constants; "
-                "what depends on other parameters is a definition",
-            ),
-        }[table]
+        known = self.known
+        rule = "a constant is made of numbers and of constants above it"
+        allowed: Collection[str] = known
+        if table == "parameters":
+            rule = "a parameter's value is made of numbers and constants; "
+            rule += "what depends on other parameters is a definition"
+            allowed = list(known)
         out = []
         for name, entry in getattr(self.doc, table).items():
             path = (table, name, "value")
@@ -373,31 +298,27 @@ class _SceneChecker(Checker):
             circular.update(cycle)
         return circular
 
-    def _inputs(self, known: Mapping[str, float]) -> list[SceneInput]:
+    def _inputs(self) -> list[SceneInput]:
         allowed = [name for name, kinds in self.kinds.items() if INPUT not in kinds]
         rule = "a signal can't depend on inputs"
         out = []
         for name, entry in self.doc.inputs.items():
             signal = self.formula(("inputs", name, "signal"), entry.signal, allowed, rule)
-            limits = self._limits(("inputs", name, "limits"), entry.limits, known)
+            limits = self._limits(("inputs", name, "limits"), entry.limits)
             if signal:
                 out.append(SceneInput(name, entry.unit, signal, entry.note, limits))
         return out
 
     def _limits(
-        self,
-        path: tuple[str, ...],
-        limits: Sequence[float | str | None],
-        known: Mapping[str, float],
+        self, path: tuple[str, ...], limits: Sequence[Value | None]
     ) -> tuple[Formula | None, ...]:
         """Return an input's checked limits, which must be in order at the parameters' values."""
-        rule = "limits are made of numbers, constants and parameters"
-        checked = [None if x is None else self.formula(path, x, known, rule) for x in limits]
-        values = [self.number(path, f, known) for f in checked if f]
+        checked = [None if x is None else self.value(path, x) for x in limits]
+        values = [pair[1] for pair in checked if pair]
         if len(values) == 2 and values[0] >= values[1]:
             why = f"the least value, {values[0]:g}, is not below the largest, {values[1]:g}"
             self.report(path, why)
-        return tuple(checked)
+        return tuple(pair and pair[0] for pair in checked)
 
     def _energy(self, key: str) -> Formula:
         path = ("energy", key)
@@ -407,11 +328,8 @@ class _SceneChecker(Checker):
         kinds = self.kinds_of(formula.tree)
         sure = UNKNOWN not in kinds and not {path, ("energy",)} & self.repaired
         fault = partial(self.report, path, text=formula.text)
-        if INPUT in kinds:
-            fault(
-                "an energy can't depend on inputs: let them act through [forces]",
-                self.find_part(formula, INPUT),
-            )
+        why = "an energy can't depend on inputs: let them act through [forces]"
+        self.depends_on(path, formula, INPUT, why)
         if key == "kinetic" and VELOCITY not in kinds and sure and not self.bodies:
             velocities = " or ".join(f"{c}_dot" for c in self.doc.coordinates)
             remedy = f"use {velocities}, or dot(...) of a definition"
@@ -428,34 +346,26 @@ class _SceneChecker(Checker):
 
     def _forces(self) -> dict[str, Formula]:
         out = {}
-        known = list(self.doc.coordinates)
         for name, value in self.doc.forces.items():
             formula = self.formula(("forces", name), value)
-            if name not in known:
-                remedy = suggest(name, known) or f": a force acts along {' or '.join(known)}"
-                self.report(("forces", name), f"'{name}' is not a coordinate{remedy}")
-            elif formula:
+            if self.is_coordinate(("forces", name), name) and formula:
                 out[name] = formula
         return out
 
-    def _outputs(self, forces: Sequence[str]) -> list[SceneOutput]:
+    def _outputs(self, forces: Sequence[str]) -> list[NamedFormula]:
         """Check the outputs, whose formulas may use all quantities of the motion."""
         self.allow_solved_quantities([f"{name}_ddot" for name in self.doc.coordinates], forces)
         out = []
         for name, entry in self.doc.outputs.items():
             path = ("outputs", name, "formula")
-            if validate_tables.reports_unknown_multiplier(
-                self, self.doc, path, entry.formula, forces
-            ):
+            if validate_tables.reports_unknown_multiplier(self, path, entry.formula, forces):
                 continue
             formula = self.formula(path, entry.formula)
             if name in self.centers and formula and formula.text.strip() != name:
-                message = (
-                    f"'{name}' is a place of a body or point already: use that, or another name"
-                )
-                self.report(("outputs", name), message)
+                why = f"'{name}' is a place of a body or point already: use that, or another name"
+                self.report(("outputs", name), why)
             if formula:
-                out.append(SceneOutput(name, entry.unit, formula, entry.note))
+                out.append(NamedFormula(name, entry.unit, formula, entry.note))
         return out
 
     def _check_requests(self) -> None:
@@ -492,17 +402,17 @@ def _repair_tables(tree: dict[str, Any], check: Checker) -> None:
     so that they can be checked. check: object that collects the errors.
     """
     for name in [n for n, entry in tree.items() if isinstance(entry, (dict, list))]:
-        if match := messages.merge_array(name, tree[name]):
+        if match := hints.merge_array(name, tree[name]):
             table, entries = match
-            check.report((name,), messages.one_table_message(name, table))
+            check.report((name,), hints.one_table_message(name, table))
             check.repaired |= {(table,), *((table, key) for key in entries)}
             del tree[name]
             existing = tree.get(table)
             tree[table] = {**entries, **(existing if isinstance(existing, dict) else {})}
             check.places.rename((name,), (table,))
-        elif name in messages.TABLES:
-            check.report((name,), f"there is no [{name}] in a scene: {messages.TABLES[name]}")
+        elif name in hints.TABLES:
+            check.report((name,), f"there is no [{name}] in a scene: {hints.TABLES[name]}")
             del tree[name]
-            if messages.TABLES[name] == messages.ENERGY:
+            if hints.TABLES[name] == hints.ENERGY:
                 tree.setdefault("energy", {"kinetic": "0"})
                 check.repaired.add(("energy",))

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 from eomc.base import names
-from eomc.scene import formulas
-from eomc.scene.formulas import FormulaError, suggest
+from eomc.scene import formulas, hints
+from eomc.scene.formulas import Formula, FormulaError, suggest
 from eomc.scene.scope import Checker, Path, value_of
-from eomc.scene.source_map import ARRAYS
+from eomc.scene.toml_text import ARRAYS
 
 _TABLES = (
     "constants", "parameters", "coordinates", "inputs", "definitions", "forces", "constraints",
@@ -25,15 +26,8 @@ _WORDS = ("unit", "note", "title", "repeat")  # keys with free text
 # no formulas
 _NAMED = ("body", "point", "loop")  # arrays whose entries have names
 _NAMES = ("name", "parent", "joint", "coordinate", "bodies", "body", "frame")
-_ARRAY_ALIASES = {
-    "bodies": "body", "Body": "body", "link": "body", "links": "body", "springs": "spring",
-    "Spring": "spring", "dampers": "damper", "Damper": "damper", "loops": "loop", "Loop": "loop",
-    "points": "point", "Point": "point", "events": "event", "Event": "event", "Events": "event",
-}  # fmt: skip
 
 _INDEXED = re.compile(r"(?<!\w)([A-Za-z_]\w*)\s*\[([^\[\]]*)\]", re.ASCII)
-_TERM = r"(?:\d+|[A-Za-z_]\w*)"
-_SUM = re.compile(rf"\s*[+-]?\s*{_TERM}\s*(?:[+-]\s*{_TERM}\s*)*", re.ASCII)
 _REPEAT = re.compile(r"\s*([A-Za-z_]\w*)\s*=(.*?)\.\.(.*)", re.ASCII | re.DOTALL)
 _WRITTEN = 'is written repeat = "i = 1..n"'
 
@@ -64,7 +58,7 @@ class _Expansion:
 
     def run(self) -> bool:
         """Expand all entries in place; return True if there were no errors."""
-        for written, array_name in _ARRAY_ALIASES.items():
+        for written, array_name in hints.ARRAYS.items():
             if isinstance(self.tree.get(written), (dict, list)) and array_name not in self.tree:
                 entries, unknown = self.tree.pop(written), f"unknown table '{written}': "
                 if not _is_array(entries):
@@ -273,42 +267,44 @@ class _Expansion:
         return out
 
     def _index_value(self, text: str, index: Mapping[str, int]) -> int:
-        """Return the value of an index or bound: integers, constants and the index with + and -."""
-        if not _SUM.fullmatch(text):
-            raise FormulaError(
-                f"'{text.strip()}' is no index: it is made of whole numbers, constants, + and -"
-            )
-        total = 0
-        for sign, term in re.findall(rf"([+-]?)\s*({_TERM})", text, re.ASCII):
-            total += self._term_value(term, index) * (-1 if sign == "-" else 1)
-        return total
+        """Return the value of an index or bound: a formula of constants and of the index."""
+        formula = _parse_index(text)
+        known = {**self.constants, **index}
+        for node in formula.names():
+            if node.id not in known:
+                raise FormulaError(self._unknown_name(node.id, index))
+            if node.id not in index:
+                self.check.used[node.id].append(("constants", node.id))
+        value, fault = value_of(formula, known)
+        if fault:
+            raise FormulaError(fault)
+        if not value.is_integer() or abs(value) >= 1e10:
+            rule = "and an index is a whole number of at most ten digits"
+            raise FormulaError(f"'{formula.shown}' is {value:g}, {rule}")
+        return int(value)
 
-    def _term_value(self, term: str, index: Mapping[str, int]) -> int:
-        if term.isdigit():
-            if len(term) > 9:
-                raise FormulaError(f"{term:.12} is too large for an index")
-            return int(term)
-        if term in index:
-            return index[term]
-        if term in self.constants:
-            self.check.used[term].append(("constants", term))
-            value = self.constants[term]
-            if not value.is_integer() or abs(value) > 1e9:
-                raise FormulaError(f"'{term}' is {value:g}, and an index is a whole number")
-            return int(value)
-        table = self.declared.get(term)
+    def _unknown_name(self, name: str, index: Mapping[str, int]) -> str:
+        """Return why a name can't be used in an index."""
+        table = self.declared.get(name)
         if table == "constants":
-            raise FormulaError(f"'{term}' has no value here: move its line above this one")
+            return f"'{name}' has no value here: move its line above this one"
         if table:
-            raise FormulaError(
-                f"'{term}' stands in [{table}], and what is repeated is decided when the code is "
+            return (
+                f"'{name}' stands in [{table}], and what is repeated is decided when the code is "
                 "made: only [constants] can count"
             )
-        near = suggest(term, [*index, *self.constants])
-        remedy = ": declare it in [constants]"
-        if term != "n" and len(term) == 1 and not index:
-            remedy += f', or add repeat = "{term} = 1..n" to the entry'
-        raise FormulaError(f"'{term}' is not known in an index{near or remedy}")
+        remedy = suggest(name, [*index, *self.constants]) or ": declare it in [constants]"
+        if name != "n" and len(name) == 1 and not index and remedy.startswith(":"):
+            remedy += f', or add repeat = "{name} = 1..n" to the entry'
+        return f"'{name}' is not known in an index{remedy}"
+
+
+@lru_cache(maxsize=1_000)  # the same text in each copy of an entry
+def _parse_index(text: str) -> Formula:
+    formula = formulas.parse(text)
+    if any(formula.calls("dot")):
+        raise FormulaError("dot(...) can't be used in an index")
+    return formula
 
 
 def _array_remedy(array: str, entries: Any) -> str:

@@ -1,4 +1,9 @@
-"""A checked scene as data, with the place of each entry in its file. Independent of SymPy and C."""
+"""A checked scene as data, with the place of each entry in its file. Independent of SymPy and C.
+
+Every vector of a body has three components and every inertia six; in a plane scene, the components
+out of the plane are zero. Formulas of bodies depend on numbers, constants and parameters unless
+stated otherwise.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +11,222 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from eomc.base.errors import EomcError, Problem
-from eomc.scene.assembly import Assembly, Turn, Vector
 from eomc.scene.formulas import Formula
+from eomc.scene.joints import CLOSINGS, REACTIONS
+from eomc.scene.schema import RunSettings
 from eomc.scene.scope import Path, value_of
-from eomc.scene.source_map import SourceMap
+from eomc.scene.toml_text import SourceMap
+
+# --- bodies ---------------------------------------------------------------------------------------
+
+WORLD = "world"  # the inertial frame, as a parent or at the end of a spring
+
+Vector = tuple[Formula, Formula, Formula]
+
+
+@dataclass(frozen=True)
+class Turn:
+    """One rotation in a sequence: by `angle` (rad) about an axis "x", "y" or "z".
+
+    The axis is that of the frame as rotated by the preceding rotations.
+    """
+
+    axis: str
+    angle: Formula
+
+
+@dataclass(frozen=True)
+class RigidBody:
+    """A rigid body, attached by a joint in a tree or placed by formulas.
+
+    Attributes
+    ----------
+    parent : str
+        Name of a body, or "world".
+    joint : str
+        Key of joints.JOINTS; "" if the body is placed by formulas.
+    coordinates : tuple of Formula
+        Displacement of each elementary motion of the joint (see joints.Joint): a coordinate of the
+        scene, or a formula of coordinates. In rad or m.
+    axes : tuple of vectors
+        Unit vectors in the joint's frame.
+    pitch : Formula or None
+        Displacement along the axis of a screw joint for each radian, in m/rad.
+    offset, rotation : vector in m, and tuple of Turn
+        Position and rotation of the joint's frame in the parent's frame. The body's frame is the
+        joint's frame, moved by the coordinates. For a body placed by formulas, `rotation` is the
+        rotation of the body's frame in the world.
+    position : vector or None
+        Position of the centre of mass in the world in m, for a body placed by formulas. `position`
+        and `rotation` of such a body may depend on coordinates, t and definitions.
+    mass : Formula
+        Mass in kg.
+    center : vector
+        Centre of mass in the body's frame in m.
+    inertia : six Formulas
+        Ixx, Iyy, Izz, Ixy, Ixz, Iyz about the centre of mass along the body's axes, in kg m^2.
+        Off-diagonal elements are those of the tensor, such as Ixy = -sum m x y.
+    armature : tuple of Formula
+        Rotor inertia of the joint, in kg or kg m^2. This tuple and those below are empty or have
+        one formula for each coordinate.
+    damping : tuple of Formula
+        Damping constant in N s/m or N m s/rad.
+    friction : tuple of Formula
+        Coulomb friction in N or N m, smoothed as friction*tanh(rate/friction_width).
+    actuator : tuple of Formula
+        Force or moment along the coordinate, as a formula that may use all names of the scene.
+    point : bool
+        True for a [[point]], a massless body on a fixed joint.
+    """
+
+    name: str
+    mass: Formula
+    inertia: tuple[Formula, Formula, Formula, Formula, Formula, Formula]
+    center: Vector
+    rotation: tuple[Turn, ...]
+    parent: str = WORLD
+    joint: str = ""
+    coordinates: tuple[Formula, ...] = ()
+    axes: tuple[tuple[float, float, float], ...] = ()
+    pitch: Formula | None = None
+    offset: Vector | None = None
+    position: Vector | None = None
+    armature: tuple[Formula, ...] = ()
+    damping: tuple[Formula, ...] = ()
+    friction: tuple[Formula, ...] = ()
+    friction_width: Formula | None = None
+    actuator: tuple[Formula, ...] = ()
+    note: str = ""
+    point: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpringDamper:
+    """A spring or damper: the place where it acts, a coordinate, two points or two angles.
+
+    coordinate: name of the coordinate along which the element acts, "" if it acts between two
+    bodies. bodies: names of the two bodies. points: position in m of each end of the element, in
+    the frame of its body. turning: True, in the plane only, if the element acts on the angle of the
+    second body minus the angle of the first; `points` is then empty.
+    """
+
+    coordinate: str = ""
+    bodies: tuple[str, str] | None = None
+    points: tuple[Vector, Vector] | None = None
+    turning: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spring(SpringDamper):
+    """A linear spring, whose force is -stiffness times its extension.
+
+    stiffness: in N/m, or N m/rad for a spring on an angle. length: the rest length or rest position
+    in m, or the rest angle in rad.
+    """
+
+    stiffness: Formula
+    length: Formula
+
+
+@dataclass(frozen=True, kw_only=True)
+class Damper(SpringDamper):
+    """A linear damper, whose force is -damping times the rate of change of its length or angle.
+
+    damping: damping constant in N s/m, or N m s/rad for a damper on an angle.
+    """
+
+    damping: Formula
+
+
+@dataclass(frozen=True)
+class Force:
+    """A force and a torque that act on a body.
+
+    point: position in m, in the body's frame, of the point at which the force acts. force, torque:
+    components in N and N m, as formulas that may use all names of the scene. in_body: True if the
+    components are along the body's axes, False if they are along the world's axes.
+    """
+
+    body: str
+    point: Vector
+    force: Vector
+    torque: Vector
+    in_body: bool = False
+
+
+@dataclass(frozen=True)
+class LoopJoint:
+    """A joint that closes a loop in a tree of bodies, or a gear between two coordinates.
+
+    Attributes
+    ----------
+    joint
+        Kind of the joint, a key of joints.CLOSINGS.
+    bodies
+        Names of the two bodies, one of which may be "world".
+    points
+        Position of the joint in the frame of each body, in m.
+    axes
+        Unit vector of the joint's axis in the frame of each body.
+    rotation
+        Rotation of the second body's frame relative to the first body's frame.
+    length
+        Distance in m that a joint of the kind "distance" keeps constant.
+    coordinates, ratio, offset
+        Data of a gear: second coordinate = ratio * first coordinate + offset.
+    """
+
+    name: str
+    joint: str
+    bodies: tuple[str, ...] = ()
+    points: tuple[Vector, ...] = ()
+    axes: tuple[tuple[float, float, float], ...] = ()
+    rotation: tuple[Turn, ...] = ()
+    length: Formula | None = None
+    coordinates: tuple[str, ...] = ()
+    ratio: Formula | None = None
+    offset: Formula | None = None
+    note: str = ""
+
+    def rows(self, plane: bool) -> dict[str, str]:
+        """Return a dict from the kind of each constraint equation of the joint to its name.
+
+        The kinds, such as "x" or "rz", are explained in `joints.Closing`. If the joint has one
+        equation, its name is that of the loop; several equations have names such as "<loop>_x".
+        plane: True for a plane scene, False for a scene in space.
+        """
+        kinds = CLOSINGS[self.joint].rows(plane)
+        if len(kinds) == 1:
+            return {kinds[0]: self.name}
+        return {kind: f"{self.name}_{kind}" for kind in kinds}
+
+    def reactions(self, plane: bool) -> tuple[str, ...]:
+        """Return the names of the components of the joint's reaction force and moment in outputs.
+
+        An example is "<loop>_force_x". plane: True for a plane scene. A gear has no reactions.
+        """
+        parts = () if self.joint == "gear" else REACTIONS[plane]
+        return tuple(f"{self.name}_{part}" for part in parts)
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """The bodies of a scene and the springs, dampers, forces and loops between them.
+
+    plane: True if the scene is plane. gravity: acceleration of gravity, m/s^2. bodies: ordered so
+    that each parent precedes its children.
+    """
+
+    plane: bool
+    gravity: Vector
+    bodies: tuple[RigidBody, ...]
+    springs: tuple[Spring, ...] = ()
+    dampers: tuple[Damper, ...] = ()
+    forces: tuple[Force, ...] = ()
+    loops: tuple[LoopJoint, ...] = ()
+
+
+# --- tables ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -63,23 +280,12 @@ class SceneInput:
 
 
 @dataclass(frozen=True)
-class SceneOutput:
-    """An output: a named quantity that is computed from the motion by a formula.
+class NamedFormula:
+    """An output or a constraint equation.
 
-    The formula may use all quantities of the scene, accelerations and constraint forces too.
-    """
-
-    name: str
-    unit: str
-    formula: Formula
-    note: str
-
-
-@dataclass(frozen=True)
-class SceneConstraint:
-    """A constraint equation: a formula that is zero along every motion.
-
-    The formula depends on coordinates and t (holonomic), or is linear in the velocities.
+    The formula of an output may use all quantities of the scene, accelerations and constraint
+    forces too. That of a constraint equation is zero along every motion; it depends on coordinates
+    and t (holonomic), or is linear in the velocities.
     """
 
     name: str
@@ -143,57 +349,6 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class RunSettings:
-    """Settings of the table [run] of a scene: what code is generated, and defaults of simulations.
-
-    Attributes
-    ----------
-    h, duration : float
-        Default step size and duration of a simulation, s.
-    methods : tuple of str
-        The steppers to generate; the first is the default.
-    real : str
-        C type of all computations.
-    batch : bool
-        Generate functions for many trajectories at once.
-    linearize : bool or "parameters"
-        Generate derivatives of the accelerations, "parameters" also those by the parameters.
-    discretize : bool
-        Generate derivatives of steps.
-    frames : bool or tuple of str
-        Bodies and points whose poses, velocities, accelerations and Jacobians are generated; True
-        for all.
-    inverse_dynamics, momentum : bool
-        Generate these functions.
-    tolerance : float or None
-        Tolerance of adaptive steps; None for fixed steps.
-    friction : str
-        "smooth", or "stick" if Coulomb friction of joints and coordinates holds them exactly.
-    """
-
-    h: float = 0.001
-    duration: float = 10.0
-    methods: tuple[str, ...] = ("rk4",)
-    real: str = "double"
-    batch: bool = False
-    linearize: bool | str = False
-    discretize: bool = False
-    frames: bool | tuple[str, ...] = False
-    inverse_dynamics: bool = False
-    momentum: bool = False
-    tolerance: float | None = None
-    friction: str = "smooth"
-
-    @property
-    def needs_derivatives(self) -> bool:
-        """True if derivatives of the accelerations must be generated.
-
-        They are needed for `linearize` and, to differentiate steps, for `discretize`.
-        """
-        return bool(self.linearize) or self.discretize
-
-
-@dataclass(frozen=True)
 class Scene:
     """A checked scene: the mechanical system and the settings that a TOML file describes.
 
@@ -231,9 +386,9 @@ class Scene:
     potential: Formula
     dissipation: Formula
     forces: Mapping[str, Formula]
-    outputs: tuple[SceneOutput, ...]
+    outputs: tuple[NamedFormula, ...]
     events: tuple[SceneEvent, ...]
-    constraints: tuple[SceneConstraint, ...]
+    constraints: tuple[NamedFormula, ...]
     run: RunSettings
     assembly: Assembly | None
     picture: Picture | None

@@ -1,19 +1,27 @@
-"""The layout of a scene file as pydantic models, with remedies for errors in it."""
+"""The layout of a scene file: its tables and their keys, with remedies for errors in it.
+
+`read` converts the tree of a TOML text to a `Document`. Each key of a table is a field of a
+dataclass with the function that checks its value. Faulty entries are reported, and have their
+defaults in the document, so that all others can be checked.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from functools import partial
-from typing import Annotated, Any, Literal
-
-import pydantic
+from typing import Any
 
 from eomc.base import texts
+from eomc.base.errors import SceneError
 from eomc.integrators.tableaux import METHODS
-from eomc.scene import messages
-from eomc.scene.formulas import nearest
+from eomc.scene import hints
+from eomc.scene.formulas import Formula, Value, nearest
+from eomc.scene.scope import UNKNOWN, Checker, Path
 
+WORLD = "world"  # the inertial frame, as a parent or at the end of a spring
 REALS, FRICTIONS = ("double", "float"), ("smooth", "stick")
 DIRECTIONS, ACTIONS = ("both", "rising", "falling"), ("record", "stop", "jump")
 MIN_TOLERANCE, MAX_TOLERANCE = 1e-15, 1e-2
@@ -35,36 +43,35 @@ def short_toml(value: object) -> str:
     return text if len(text) <= 40 else text[:37] + "..."
 
 
-def entry(value: object) -> float | str:
-    """Check that a TOML value is a finite number or a text (a formula), and return it.
+def _expected(what: str, value: object) -> ValueError:
+    return ValueError(f"must be {what}, here {short_toml(value)}")
+
+
+def entry(value: object) -> Value:
+    """Check that a value is a finite number or a formula, and return it.
 
     Numbers are returned as float. Raises ValueError otherwise.
     """
-    if isinstance(value, str):
+    if isinstance(value, (str, Formula)):
         return value
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
-        try:
-            if math.isfinite(number := float(value)):
-                return number
-        except OverflowError:
-            pass
-        raise ValueError(f"must be a finite number, here {short_toml(value)}")
-    raise ValueError(f"must be a number or a formula in quotes, here {short_toml(value)}")
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise _expected("a number or a formula in quotes", value)
+    if not abs(value) < math.inf or abs(value) > sys.float_info.max:
+        raise _expected("a finite number", value)
+    return float(value)
 
 
-def vector(value: object) -> tuple[float | str, ...]:
+def vector(value: object) -> tuple[Value, ...]:
     """Check that a TOML value is a list of numbers and formulas, and return it as a tuple.
 
     Raises ValueError otherwise.
     """
     if not isinstance(value, list) or not value:
-        raise ValueError(
-            f"must be a list of numbers and formulas, such as [0, 1.5], here {short_toml(value)}"
-        )
+        raise _expected("a list of numbers and formulas, such as [0, 1.5]", value)
     return tuple(map(entry, value))
 
 
-def scalar_or_list(value: object) -> float | str | tuple[float | str, ...]:
+def scalar_or_list(value: object) -> Value | tuple[Value, ...]:
     """Check that a TOML value is a number or formula, or a list of these.
 
     Returns the single value, or a tuple with the values of the list, such as one for each
@@ -73,7 +80,7 @@ def scalar_or_list(value: object) -> float | str | tuple[float | str, ...]:
     return tuple(map(entry, value)) if isinstance(value, list) else entry(value)
 
 
-def rotation(value: object) -> float | str | tuple[tuple[str, float | str], ...]:
+def rotation(value: object) -> Value | tuple[tuple[str, Value], ...]:
     """Check that a TOML value is an angle, or a list of turns such as [["z", "pi/2"]].
 
     Returns the angle, or a tuple of pairs (axis, angle). Angles are numbers or formulas in rad.
@@ -81,15 +88,11 @@ def rotation(value: object) -> float | str | tuple[tuple[str, float | str], ...]
     """
     if not isinstance(value, list):
         return entry(value)
-    turns = []
     for turn in value:
         if not (isinstance(turn, list) and len(turn) == 2 and turn[0] in ("x", "y", "z")):
-            raise ValueError(
-                'must be a list of turns, each an axis and an angle, such as [["z", "pi/2"]], '
-                f"here {short_toml(value)}"
-            )
-        turns.append((turn[0], entry(turn[1])))
-    return tuple(turns)
+            what = 'a list of turns, each an axis and an angle, such as [["z", "pi/2"]]'
+            raise _expected(what, value)
+    return tuple((axis, entry(angle)) for axis, angle in value)
 
 
 def axes(value: object) -> tuple[tuple[float, ...], ...]:
@@ -97,34 +100,26 @@ def axes(value: object) -> tuple[tuple[float, ...], ...]:
 
     Returns a tuple of axes, each a tuple of floats. Raises ValueError otherwise.
     """
-    axes: list[Any] = [value]
-    if isinstance(value, list) and value and isinstance(value[0], list):
-        axes = value
-    for axis in axes:
+    several = isinstance(value, list) and value and isinstance(value[0], list)
+    out: list[Any] = value if several else [value]  # type: ignore[assignment]
+    for axis in out:
         if not (isinstance(axis, list) and axis and all(map(_is_number, axis))):
-            raise ValueError(
-                f"must be a list of numbers, such as [0, 0, 1], here {short_toml(value)}"
-            )
-    return tuple(tuple(float(entry) for entry in axis) for axis in axes)
+            raise _expected("a list of numbers, such as [0, 0, 1]", value)
+    return tuple(tuple(map(float, axis)) for axis in out)
 
 
 def _is_number(value: object) -> bool:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return False
-    return abs(value) < 1e100
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e100
 
 
-def limits(value: object) -> tuple[float | str | None, ...]:
+def limits(value: object) -> tuple[Value | None, ...]:
     """Check that a TOML value is a pair of limits, such as [-1, 1] or [0, inf].
 
     Returns the smallest and the largest value, each a number, a formula, or None if infinite.
     Raises ValueError otherwise.
     """
     if not (isinstance(value, list) and len(value) == 2):
-        raise ValueError(
-            "must be the least and the largest value, such as [-1, 1] or [0, inf], "
-            f"here {short_toml(value)}"
-        )
+        raise _expected("the least and the largest value, such as [-1, 1] or [0, inf]", value)
     unbounded = (("-inf", -math.inf), ("inf", "+inf", math.inf))
     return tuple(None if x in none else entry(x) for x, none in zip(value, unbounded, strict=True))
 
@@ -136,46 +131,70 @@ def names(value: object) -> tuple[str, ...]:
     """
     names_ = value if isinstance(value, list) else [value]
     if not all(isinstance(name, str) for name in names_):
-        raise ValueError(f"must be a name in quotes, or a list of names, here {short_toml(value)}")
+        raise _expected("a name in quotes, or a list of names", value)
     return tuple(names_)
 
 
-def two_names(value: object) -> tuple[str, ...]:
-    """Check that a TOML value is a list of the names of two bodies, and return it as a tuple.
+def two_names(what: str, value: object) -> tuple[str, ...]:
+    """Check that a TOML value is a list of two names, and return it as a tuple.
 
-    Raises ValueError otherwise. The bodies need not exist.
+    what: what they name, with an example, for the message. Raises ValueError otherwise.
     """
-    names_ = names(value)
-    if len(names_) != 2:
-        raise ValueError(
-            f'must name two bodies, such as ["world", "cart"], here {short_toml(value)}'
-        )
+    if len(names_ := names(value)) != 2:
+        raise ValueError(f"must name two {what}, here {short_toml(value)}")
     return names_
 
 
-def two_coordinates(value: object) -> tuple[str, ...]:
-    """Check that a TOML value is a list of the names of two coordinates; return it as a tuple.
-
-    Raises ValueError otherwise. The coordinates need not exist.
-    """
-    names_ = names(value)
-    if len(names_) != 2:
-        raise ValueError(
-            f'must name two coordinates, such as ["phi", "psi"], here {short_toml(value)}'
-        )
-    return names_
-
-
-def points(value: object) -> tuple[tuple[float | str, ...], ...]:
+def points(value: object) -> tuple[tuple[Value, ...], ...]:
     """Check that a TOML value is a list of two points, such as [[0, 0], ["l", 0]].
 
     Returns a tuple of two vectors of numbers and formulas. Raises ValueError otherwise.
     """
     if not (isinstance(value, list) and len(value) == 2):
-        raise ValueError(
-            f'must be two points, such as [[0, 0], ["l", 0]], here {short_toml(value)}'
-        )
+        raise _expected('two points, such as [[0, 0], ["l", 0]]', value)
     return tuple(map(vector, value))
+
+
+def text(value: object) -> str:
+    """Check that a TOML value is a text, and return it. Raises ValueError otherwise."""
+    if isinstance(value, str):
+        return value
+    raise _expected("text in quotes", value)
+
+
+def line(value: object) -> str:
+    """Check that a TOML value is a text in one line without hidden characters, and return it."""
+    return texts.checked_line(text(value))
+
+
+def note(value: object) -> str:
+    """Check that a TOML value is a text without hidden characters, and return it."""
+    return texts.checked_lines(text(value))
+
+
+def flag(value: object) -> bool:
+    """Check that a TOML value is true or false, and return it. Raises ValueError otherwise."""
+    if isinstance(value, bool):
+        return value
+    raise _expected("true or false", value)
+
+
+def choice(what: str, words: Sequence[str], value: object) -> str:
+    """Check that a TOML value is one of some words, and return it. Raises ValueError otherwise.
+
+    what: what the word names, for the message.
+    """
+    if value in words:
+        return str(value)
+    raise ValueError(f"unknown {what} {short_toml(value)}: known are {', '.join(words)}")
+
+
+def version(value: object) -> int:
+    """Check that a TOML value is the version 1 of the format. Raises ValueError otherwise."""
+    if value != 1 or isinstance(value, bool):
+        here = short_toml(value)
+        raise ValueError(f"format {here} is not known to this version, which reads eomc = 1")
+    return 1
 
 
 # --- [run] ---------------------------------------------------------------------------------------
@@ -188,7 +207,7 @@ def linearization(value: object) -> bool | str:
     """
     if isinstance(value, bool) or value == "parameters":
         return value
-    raise ValueError(f'must be true, false or "parameters", here {short_toml(value)}')
+    raise _expected('true, false or "parameters"', value)
 
 
 def frame_selection(value: object) -> bool | tuple[str, ...]:
@@ -200,24 +219,50 @@ def frame_selection(value: object) -> bool | tuple[str, ...]:
         return value
     if isinstance(value, list) and all(isinstance(name, str) for name in value):
         return tuple(dict.fromkeys(value))
-    example = 'true, or a list of bodies and points such as ["tip"]'
-    raise ValueError(f"must be {example}, here {short_toml(value)}")
+    raise _expected('true, or a list of bodies and points such as ["tip"]', value)
+
+
+def positive(value: object) -> float:
+    """Check that a TOML value is a positive, finite number, and return it as float.
+
+    Raises ValueError otherwise.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        here = f"{short_toml(value)}{hints.number_remedy(value)}"
+        raise ValueError(f"must be a number, here {here}")
+    if value <= 0:
+        raise _expected("greater than zero", value)
+    return float(entry(value))  # type: ignore[arg-type]  # finite
+
+
+def tolerance(value: object) -> float:
+    """Check that a TOML value is a tolerance of adaptive steps. Raises ValueError otherwise."""
+    if isinstance(value, (int, float)) and MIN_TOLERANCE <= value <= MAX_TOLERANCE:
+        return float(value)
+    raise _expected("a number from 1e-15 to 1e-2", value)
+
+
+def methods(value: object) -> tuple[str, ...]:
+    """Check that a TOML value is the name of a stepper or a list of names; return a tuple.
+
+    The first is the default of runs. Raises ValueError for unknown names.
+    """
+    each = value if isinstance(value, list) and value else [value]
+    return tuple(dict.fromkeys(choice("method", (*METHODS, "auto"), name) for name in each))
 
 
 # --- [picture] ------------------------------------------------------------------------------------
 
-Place = str | tuple[float | str, ...]  # a name, or a vector
+Place = str | tuple[Value, ...]  # a name, or a vector
 
 
-def named_points(value: object) -> dict[str, tuple[float | str, ...]]:
+def named_points(value: object) -> dict[str, tuple[Value, ...]]:
     """Check that a TOML value is a table of points, and return their vectors by name.
 
     Each vector is a tuple of numbers and formulas. Raises ValueError otherwise.
     """
     if not isinstance(value, dict):
-        raise ValueError(
-            f'must be a table, such as {{ tip = ["x", "l*cos(theta)"] }}, here {short_toml(value)}'
-        )
+        raise _expected('a table, such as { tip = ["x", "l*cos(theta)"] }', value)
     return {name: vector(entries) for name, entries in value.items()}
 
 
@@ -231,7 +276,7 @@ def places(value: object) -> tuple[Place, ...]:
     Raises ValueError otherwise.
     """
     if not isinstance(value, list):
-        raise ValueError(f'must be a list of points, such as ["tip"], here {short_toml(value)}')
+        raise _expected('a list of points, such as ["tip"]', value)
     return tuple(map(_place, value))
 
 
@@ -243,12 +288,11 @@ def lines(value: object) -> tuple[tuple[Place, ...], ...]:
     """
     example = 'a list of lines, such as [["cart", "tip"]]'
     if not isinstance(value, list):
-        raise ValueError(f"must be {example}, here {short_toml(value)}")
+        raise _expected(example, value)
     for line in value:
         if not (isinstance(line, list) and len(line) >= 2):
-            raise ValueError(
-                f"must be {example}, each through two points or more: {short_toml(line)}"
-            )
+            what = f"{example}, each through two points or more: {short_toml(line)}"
+            raise ValueError(f"must be {what}")
     return tuple(map(places, value))
 
 
@@ -257,45 +301,30 @@ def ends(value: object) -> tuple[tuple[Place, ...], ...]:
 
     Returns a tuple of pairs of points (names or vectors). Raises ValueError otherwise.
     """
-    pairs = lines(value)
-    for pair in pairs:
+    for pair in (pairs := lines(value)):
         if len(pair) != 2:
             raise ValueError(f"each goes from a point to another, here there are {len(pair)}")
     return pairs
 
 
-Solid = tuple[Place, tuple[float | str, ...], object]  # place, size, rotation
+Solid = tuple[Place, tuple[Value, ...], object]  # place, size, rotation
 
 
-def boxes(value: object) -> tuple[Solid, ...]:
-    """Check that a TOML value is a list of boxes, such as { at = "cart", size = [0.4, 0.2] }.
+def solids(size: str, example: str, value: object) -> tuple[Solid, ...]:
+    """Check that a TOML value is a list of boxes or circles.
 
-    Returns a tuple of (centre, edges, rotation), where the rotation is None if it is not given.
-    Raises ValueError otherwise.
+    size: the key of their size, "size" for the edges of a box or "radius". example: one of them.
+    Returns a tuple of (centre, edges or radius, rotation), where the rotation is None if it is not
+    given. Raises ValueError otherwise.
     """
-    return _solids(value, "size", '{ at = "cart", size = [0.4, 0.2] }')
-
-
-def circles(value: object) -> tuple[Solid, ...]:
-    """Check that a TOML value is a list of circles, such as { at = "wheel", radius = 0.1 }.
-
-    Returns a tuple of (centre, (radius,), rotation), where the rotation is None if it is not given.
-    Raises ValueError otherwise.
-    """
-    return _solids(value, "radius", '{ at = "wheel", radius = 0.1 }')
-
-
-def _solids(value: object, size: str, example: str) -> tuple[Solid, ...]:
-    keys = ("at", size, "rotation")
     out = []
-    for table in value if isinstance(value, list) else [value]:
-        if not isinstance(table, dict) or not {"at", size} <= table.keys() <= {*keys}:
-            raise ValueError(
-                f"must be a list of tables with {keys[0]}, {keys[1]} and perhaps {keys[2]}, "
-                f"such as [{example}], here {short_toml(table)}"
-            )
-        extent = table[size]
-        large = vector(extent) if size == "size" else (entry(extent),)
+    tables: list[Any] = value if isinstance(value, list) else [value]
+    for table in tables:
+        keys = table.keys() if isinstance(table, dict) else set()
+        if not {"at", size} <= keys <= {"at", size, "rotation"}:
+            what = f"a list of tables with at, {size} and perhaps rotation, such as [{example}]"
+            raise _expected(what, table)
+        large = vector(table[size]) if size == "size" else (entry(table[size]),)
         turned = rotation(table["rotation"]) if "rotation" in table else None
         out.append((_place(table["at"]), large, turned))
     return tuple(out)
@@ -308,518 +337,446 @@ def plane_axes(value: object) -> str:
     """
     if value in ("xy", "xz", "yz"):
         return str(value)
-    raise ValueError(
-        'must be "xy", "xz" or "yz", what is drawn to the right and upwards, '
-        f"here {short_toml(value)}"
-    )
+    raise _expected('"xy", "xz" or "yz", what is drawn to the right and upwards', value)
 
 
 # --- tables ---------------------------------------------------------------------------------------
 
-_NAMES = (*METHODS, "auto")
 
-_Number = Annotated[float, pydantic.Field(strict=True, allow_inf_nan=False)]
-_Value = _Number | pydantic.StrictStr
+def key(
+    check: Callable[[object], Any], default: Any = None, missing: str = "", name: str = ""
+) -> Any:
+    """Return a field for a key of a table.
 
-_Line = Annotated[pydantic.StrictStr, pydantic.AfterValidator(texts.checked_line)]
-_Note = Annotated[pydantic.StrictStr, pydantic.AfterValidator(texts.checked_lines)]
-_Positive = Annotated[float, pydantic.Field(strict=True, gt=0, allow_inf_nan=False)]
-
-
-_Tolerance = Annotated[
-    float, pydantic.Field(strict=True, ge=MIN_TOLERANCE, le=MAX_TOLERANCE, allow_inf_nan=False)
-]
+    check: function that converts its value and raises ValueError with a remedy. default: value
+    where there is no entry, or a faulty one. missing: the remedy where there is none, if the key is
+    required. name: the key, by default the name of the field.
+    """
+    return field(default=default, metadata={"check": check, "missing": missing, "name": name})
 
 
-class _Table(pydantic.BaseModel):
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+def table(model: type, missing: str = "") -> Any:
+    """Return a field for a table, None if there is none. missing: the remedy if it is required."""
+    return field(default=None, metadata={"table": model, "missing": missing})
 
 
-class _Coordinate(_Table):
-    unit: _Line = ""
-    start: _Value = 0.0
-    rate: _Value = 0.0
-    guess: pydantic.StrictBool = False
-    friction: _Value | None = None
-    friction_width: _Value | None = None
-    note: _Note = ""
+def tables(model: type, first: str = "", short: bool = False, missing: str = "") -> Any:
+    """Return a field for a table of tables, a dict from their names to them.
+
+    first: a key of each. short: whether its value may stand for the table.
+    """
+    metadata = {"tables": model, "first": first, "short": short, "missing": missing}
+    return field(default_factory=dict, metadata=metadata)
 
 
-class QuantityTable(_Table):
+def entries() -> Any:
+    """Return a field for a table of formulas, a dict from their names to them."""
+    return field(default_factory=dict, metadata={"entries": entry})
+
+
+@dataclass(frozen=True)
+class CoordinateTable:
+    """A coordinate in the file. written: the valid keys of its table."""
+
+    unit: str = key(line, "")
+    start: Value = key(entry, 0.0)
+    rate: Value = key(entry, 0.0)
+    guess: bool = key(flag, False)
+    friction: Value | None = key(entry)
+    friction_width: Value | None = key(entry)
+    note: str = key(note, "")
+    written: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True)
+class QuantityTable:
     """A parameter or constant in the file."""
 
-    value: _Value
-    unit: _Line = ""
-    note: _Note = ""
+    value: Value = key(entry, 1.0, missing="add value = ...")
+    unit: str = key(line, "")
+    note: str = key(note, "")
 
 
-_Limits = Annotated[tuple[float | str | None, ...], pydantic.PlainValidator(limits)]
+@dataclass(frozen=True)
+class InputTable:
+    """An input in the file."""
+
+    unit: str = key(line, "")
+    signal: Value = key(entry, 0.0)
+    limits: tuple[Value | None, ...] = key(limits, (None, None))
+    note: str = key(note, "")
 
 
-class _Input(_Table):
-    unit: _Line = ""
-    signal: _Value = 0.0
-    limits: _Limits = (None, None)
-    note: _Note = ""
-
-
-class OutputTable(_Table):
+@dataclass(frozen=True)
+class OutputTable:
     """An output or constraint in the file."""
 
-    formula: _Value
-    unit: _Line = ""
-    note: _Note = ""
+    formula: Value = key(entry, 1.0, missing="add formula = ...")
+    unit: str = key(line, "")
+    note: str = key(note, "")
 
 
-class _Energy(_Table):
-    kinetic: _Value
-    potential: _Value = 0.0
-    dissipation: _Value = 0.0
+@dataclass(frozen=True)
+class EnergyTable:
+    """The table [energy] in the file."""
+
+    kinetic: Value = key(entry, 0.0, missing=f'add kinetic = "..."; {hints.GIVE_ENERGIES}')
+    potential: Value = key(entry, 0.0)
+    dissipation: Value = key(entry, 0.0)
 
 
-def _as_tuple(value: object) -> object:
-    """Return `method = "rk4"` as a list of one; the first method is the default of runs."""
-    if isinstance(value, list) and value:
-        return tuple(dict.fromkeys(map(str, value)))
-    return (value,)
+@dataclass(frozen=True)
+class RunSettings:
+    """Settings of the table [run] of a scene: what code is generated, and defaults of simulations.
+
+    Attributes
+    ----------
+    h, duration : float
+        Default step size and duration of a simulation, s.
+    methods : tuple of str
+        The steppers to generate; the first is the default.
+    real : str
+        C type of all computations.
+    batch : bool
+        Generate functions for many trajectories at once.
+    linearize : bool or "parameters"
+        Generate derivatives of the accelerations, "parameters" also those by the parameters.
+    discretize : bool
+        Generate derivatives of steps.
+    frames : bool or tuple of str
+        Bodies and points whose poses, velocities, accelerations and Jacobians are generated; True
+        for all.
+    inverse_dynamics, momentum : bool
+        Generate these functions.
+    tolerance : float or None
+        Tolerance of adaptive steps; None for fixed steps.
+    friction : str
+        "smooth", or "stick" if Coulomb friction of joints and coordinates holds them exactly.
+    """
+
+    h: float = key(positive, 0.001)
+    duration: float = key(positive, 10.0)
+    methods: tuple[str, ...] = key(methods, ("rk4",), name="method")
+    real: str = key(partial(choice, "type", REALS), "double")
+    batch: bool = key(flag, False)
+    linearize: bool | str = key(linearization, False)
+    discretize: bool = key(flag, False)
+    frames: bool | tuple[str, ...] = key(frame_selection, False)
+    inverse_dynamics: bool = key(flag, False)
+    momentum: bool = key(flag, False)
+    tolerance: float | None = key(tolerance)
+    friction: str = key(partial(choice, "friction", FRICTIONS), "smooth")
+
+    @property
+    def needs_derivatives(self) -> bool:
+        """True if derivatives of the accelerations must be generated.
+
+        They are needed for `linearize` and, to differentiate steps, for `discretize`.
+        """
+        return bool(self.linearize) or self.discretize
 
 
-_Methods = Annotated[
-    tuple[Literal[_NAMES], ...],  # type: ignore[valid-type]
-    pydantic.BeforeValidator(_as_tuple),
-]
+_TWO_BODIES = partial(two_names, 'bodies, such as ["world", "cart"]')
+_TWO_COORDINATES = partial(two_names, 'coordinates, such as ["phi", "psi"]')
 
 
-class _Run(_Table):
-    h: _Positive = 0.001
-    duration: _Positive = 10.0
-    methods: _Methods = pydantic.Field(default=("rk4",), alias="method")
-    real: Literal[REALS] = "double"  # type: ignore[valid-type]
-    batch: pydantic.StrictBool = False
-    linearize: Annotated[bool | str, pydantic.PlainValidator(linearization)] = False
-    discretize: pydantic.StrictBool = False
-    frames: Annotated[bool | tuple[str, ...], pydantic.PlainValidator(frame_selection)] = False
-    inverse_dynamics: pydantic.StrictBool = False
-    momentum: pydantic.StrictBool = False
-    tolerance: _Tolerance | None = None
-    friction: Literal[FRICTIONS] = "smooth"  # type: ignore[valid-type]
-
-
-def _as_table(key: str, value: object) -> object:
-    """Return `m = 2.0` as `m = { value = 2.0 }`."""
-    return value if isinstance(value, dict) else {key: value}
-
-
-_Short = Annotated[QuantityTable, pydantic.BeforeValidator(partial(_as_table, "value"))]
-_Formula = Annotated[OutputTable, pydantic.BeforeValidator(partial(_as_table, "formula"))]
-
-
-_Vector = Annotated[tuple[float | str, ...], pydantic.PlainValidator(vector)]
-_Each = Annotated[float | str | tuple[float | str, ...], pydantic.PlainValidator(scalar_or_list)]
-_Rotation = Annotated[
-    float | str | tuple[tuple[str, float | str], ...], pydantic.PlainValidator(rotation)
-]
-_Axes = Annotated[tuple[tuple[float, ...], ...], pydantic.PlainValidator(axes)]
-_Names = Annotated[tuple[str, ...], pydantic.PlainValidator(names)]
-_TwoNames = Annotated[tuple[str, ...], pydantic.PlainValidator(two_names)]
-_TwoCoordinates = Annotated[tuple[str, ...], pydantic.PlainValidator(two_coordinates)]
-_Points = Annotated[tuple[tuple[float | str, ...], ...], pydantic.PlainValidator(points)]
-
-
-class BodyTable(_Table):
+@dataclass(frozen=True)
+class BodyTable:
     """A [[body]] in the file; missing keys are None."""
 
-    name: pydantic.StrictStr
-    note: _Note = ""
-    parent: pydantic.StrictStr | None = None
-    joint: pydantic.StrictStr | None = None
-    coordinates: _Names | None = None
-    axis: _Axes | None = None
-    offset: _Vector | None = None
-    position: _Vector | None = None
-    rotation: _Rotation | None = None
-    mass: _Value = 0.0
-    center: _Vector | None = None
-    inertia: _Each | None = None
-    armature: _Each | None = None
-    damping: _Each | None = None
-    friction: _Each | None = None
-    friction_width: _Value | None = None
-    actuator: _Each | None = None
+    name: str = key(text, missing='give the body a name: name = "..."')
+    note: str = key(note, "")
+    parent: str | None = key(text)
+    joint: str | None = key(text)
+    coordinates: tuple[str, ...] | None = key(names)
+    axis: tuple[tuple[float, ...], ...] | None = key(axes)
+    pitch: Value | None = key(entry)
+    offset: tuple[Value, ...] | None = key(vector)
+    position: tuple[Value, ...] | None = key(vector)
+    rotation: Any = key(rotation)
+    mass: Value = key(entry, 0.0)
+    center: tuple[Value, ...] | None = key(vector)
+    inertia: Value | tuple[Value, ...] | None = key(scalar_or_list)
+    armature: Value | tuple[Value, ...] | None = key(scalar_or_list)
+    damping: Value | tuple[Value, ...] | None = key(scalar_or_list)
+    friction: Value | tuple[Value, ...] | None = key(scalar_or_list)
+    friction_width: Value | None = key(entry)
+    actuator: Value | tuple[Value, ...] | None = key(scalar_or_list)
 
 
-class PointTable(_Table):
+@dataclass(frozen=True)
+class PointTable:
     """A [[point]] in the file."""
 
-    name: pydantic.StrictStr
-    body: pydantic.StrictStr
-    place: _Vector | None = None
-    rotation: _Rotation | None = None
-    note: _Note = ""
+    name: str = key(text, missing='give the point a name: name = "..."')
+    body: str = key(text, WORLD, missing='name the body that it is fixed to: body = "..."')
+    place: tuple[Value, ...] | None = key(vector)
+    rotation: Any = key(rotation)
+    note: str = key(note, "")
 
 
-class _SpringDamperTable(_Table):
+@dataclass(frozen=True)
+class SpringDamperTable:
     """Common keys of springs and dampers."""
 
-    coordinate: pydantic.StrictStr | None = None
-    bodies: _TwoNames | None = None
-    points: _Points | None = None
-    turning: pydantic.StrictBool = False
-    note: _Note = ""
+    coordinate: str | None = key(text)
+    bodies: tuple[str, ...] | None = key(_TWO_BODIES)
+    points: tuple[tuple[Value, ...], ...] | None = key(points)
+    turning: bool = key(flag, False)
+    note: str = key(note, "")
 
 
-class SpringTable(_SpringDamperTable):
+@dataclass(frozen=True)
+class SpringTable(SpringDamperTable):
     """A [[spring]] in the file."""
 
-    stiffness: _Value
-    length: _Value = 0.0
+    stiffness: Value = key(entry, 1.0, missing='add stiffness = "..."')
+    length: Value = key(entry, 0.0)
 
 
-class DamperTable(_SpringDamperTable):
+@dataclass(frozen=True)
+class DamperTable(SpringDamperTable):
     """A [[damper]] in the file."""
 
-    damping: _Value
+    damping: Value = key(entry, 1.0, missing='add damping = "..."')
 
 
-class ForceTable(_Table):
+def _frame(value: object) -> str:
+    if value in ("world", "body"):
+        return str(value)
+    raise _expected('"world" or "body", whose axes the entries are along', value)
+
+
+_FORCE_BODY = (
+    'name the body that it acts on, body = "..."; a force along a coordinate stands in [forces], '
+    'x = "F - b*x_dot"'
+)
+
+
+@dataclass(frozen=True)
+class ForceTable:
     """A [[force]] in the file."""
 
-    body: pydantic.StrictStr
-    point: _Vector | None = None
-    force: _Vector | None = None
-    torque: _Each | None = None
-    frame: Literal["world", "body"] = "world"
-    note: _Note = ""
+    body: str = key(text, WORLD, missing=_FORCE_BODY)
+    point: tuple[Value, ...] | None = key(vector)
+    force: tuple[Value, ...] | None = key(vector)
+    torque: Value | tuple[Value, ...] | None = key(scalar_or_list)
+    frame: str = key(_frame, "world")
+    note: str = key(note, "")
 
 
-class LoopTable(_Table):
+@dataclass(frozen=True)
+class LoopTable:
     """A [[loop]] in the file; missing keys are None."""
 
-    name: pydantic.StrictStr
-    joint: pydantic.StrictStr
-    bodies: _TwoNames | None = None
-    points: _Points | None = None
-    axis: _Axes | None = None
-    rotation: _Rotation | None = None
-    length: _Value | None = None
-    coordinates: _TwoCoordinates | None = None
-    ratio: _Value | None = None
-    offset: _Value | None = None
-    note: _Note = ""
+    name: str = key(text, missing='give the loop a name: name = "..."')
+    joint: str = key(text, "", missing='say what closes it: joint = "revolute" or another')
+    bodies: tuple[str, ...] | None = key(_TWO_BODIES)
+    points: tuple[tuple[Value, ...], ...] | None = key(points)
+    axis: tuple[tuple[float, ...], ...] | None = key(axes)
+    rotation: Any = key(rotation)
+    length: Value | None = key(entry)
+    coordinates: tuple[str, ...] | None = key(_TWO_COORDINATES)
+    ratio: Value | None = key(entry)
+    offset: Value | None = key(entry)
+    note: str = key(note, "")
 
 
-class EventTable(_Table):
-    """An [[event]] in the file; other keys are coordinates and velocities after a jump."""
+@dataclass(frozen=True)
+class EventTable:
+    """An [[event]] in the file. jump: its other keys, coordinates and velocities after a jump."""
 
-    model_config = pydantic.ConfigDict(extra="allow", frozen=True)
-
-    name: pydantic.StrictStr
-    when: _Value
-    direction: Literal[DIRECTIONS] = "both"  # type: ignore[valid-type]
-    action: Literal[ACTIONS] = "record"  # type: ignore[valid-type]
-    note: _Note = ""
-
-
-_Places = Annotated[tuple[Place, ...], pydantic.PlainValidator(places)]
-_Lines = Annotated[tuple[Any, ...], pydantic.PlainValidator(lines)]
-_Ends = Annotated[tuple[Any, ...], pydantic.PlainValidator(ends)]
-_Boxes = Annotated[tuple[Any, ...], pydantic.PlainValidator(boxes)]
-_Circles = Annotated[tuple[Any, ...], pydantic.PlainValidator(circles)]
+    name: str = key(text, missing='give the event a name: name = "..."')
+    when: Value = key(entry, 1.0, missing='add when = "...", whose zeros are the event')
+    direction: str = key(partial(choice, "direction", DIRECTIONS), "both")
+    action: str = key(partial(choice, "action", ACTIONS), "record")
+    note: str = key(note, "")
+    jump: Mapping[str, Value] = field(default_factory=dict)
 
 
-class PictureTable(_Table):
+@dataclass(frozen=True)
+class PictureTable:
     """The table [picture] in the file."""
 
-    points: Annotated[dict[str, Any], pydantic.PlainValidator(named_points)] = {}
-    dots: _Places = ()
-    lines: _Lines = ()
-    springs: _Ends = ()
-    boxes: _Boxes = ()
-    circles: _Circles = ()
-    paths: _Places = ()
-    axes: Annotated[str, pydantic.PlainValidator(plane_axes)] = ""
+    points: Mapping[str, tuple[Value, ...]] | None = key(named_points)
+    dots: tuple[Place, ...] = key(places, ())
+    lines: tuple[tuple[Place, ...], ...] = key(lines, ())
+    springs: tuple[tuple[Place, ...], ...] = key(ends, ())
+    boxes: tuple[Solid, ...] = key(
+        partial(solids, "size", '{ at = "cart", size = [0.4, 0.2] }'), ()
+    )
+    circles: tuple[Solid, ...] = key(
+        partial(solids, "radius", '{ at = "wheel", radius = 0.1 }'), ()
+    )
+    paths: tuple[Place, ...] = key(places, ())
+    axes: str = key(plane_axes, "")
 
 
-class Document(_Table):
+_ADD_COORDINATES = 'add [coordinates] with entries such as x = { unit = "m", start = 0.0 }'
+_ADD_NAME = 'add name = "...", which names the module and begins every C symbol'
+
+
+@dataclass(frozen=True)
+class Document:
     """A whole scene file."""
 
-    eomc: Literal[1]
-    name: pydantic.StrictStr
-    title: _Line = ""
-    note: _Note = ""
-    gravity: _Vector | None = None
-    coordinates: dict[str, _Coordinate] = pydantic.Field(min_length=1)
-    parameters: dict[str, _Short] = {}
-    constants: dict[str, _Short] = {}
-    inputs: dict[str, _Input] = {}
-    definitions: dict[str, _Value] = {}
-    energy: _Energy
-    forces: dict[str, _Value] = {}
-    constraints: dict[str, _Formula] = {}
-    outputs: dict[str, _Formula] = {}
-    body: dict[str, BodyTable] = {}
-    point: dict[str, PointTable] = {}
-    spring: dict[str, SpringTable] = {}
-    damper: dict[str, DamperTable] = {}
-    force: dict[str, ForceTable] = {}
-    loop: dict[str, LoopTable] = {}
-    event: dict[str, EventTable] = {}
-    picture: PictureTable | None = None
-    run: _Run = _Run()
+    eomc: int = key(version, 1, missing="begin the scene with eomc = 1, its format")
+    name: str = key(text, "scene", missing=_ADD_NAME)
+    title: str = key(line, "")
+    note: str = key(note, "")
+    gravity: tuple[Value, ...] | None = key(vector)
+    coordinates: dict[str, CoordinateTable] = tables(
+        CoordinateTable, "start", missing=_ADD_COORDINATES
+    )
+    parameters: dict[str, QuantityTable] = tables(QuantityTable, "value", short=True)
+    constants: dict[str, QuantityTable] = tables(QuantityTable, "value", short=True)
+    inputs: dict[str, InputTable] = tables(InputTable, "signal")
+    definitions: dict[str, Value] = entries()
+    energy: EnergyTable = table(
+        EnergyTable, missing='add [energy] with kinetic = "..." and potential = "..."'
+    )
+    forces: dict[str, Value] = entries()
+    constraints: dict[str, OutputTable] = tables(OutputTable, "formula", short=True)
+    outputs: dict[str, OutputTable] = tables(OutputTable, "formula", short=True)
+    body: dict[str, BodyTable] = tables(BodyTable)
+    point: dict[str, PointTable] = tables(PointTable)
+    spring: dict[str, SpringTable] = tables(SpringTable)
+    damper: dict[str, DamperTable] = tables(DamperTable)
+    force: dict[str, ForceTable] = tables(ForceTable)
+    loop: dict[str, LoopTable] = tables(LoopTable)
+    event: dict[str, EventTable] = tables(EventTable)
+    picture: PictureTable | None = table(PictureTable)
+    run: RunSettings = table(RunSettings)
 
 
-def read(tree: Mapping[str, Any]) -> Document:
-    """Check the layout of a scene given as a tree of dicts and lists, and return its document.
+# --- reading --------------------------------------------------------------------------------------
 
-    Raises pydantic.ValidationError if the layout is wrong.
+
+def keys(model: type) -> list[str]:
+    """Return the keys of a table."""
+    return [f.metadata.get("name") or f.name for f in fields(model) if f.metadata]
+
+
+def read(tree: Mapping[str, Any], check: Checker) -> Document:
+    """Convert the tree of a scene to its document. Errors are reported to `check`.
+
+    Raises SceneError with all errors so far if there are no coordinates, on which all else depends.
     """
     energy = tree.get("energy", {})
     if tree.get("body") and isinstance(energy, dict):  # bodies have energies of their own
         tree = {**tree, "energy": {"kinetic": 0.0, **energy}}
-    return Document.model_validate(tree)
+    document: Document = _Reader(check).table(Document, tree, ())
+    if not document.coordinates:
+        if ("coordinates",) not in check.repaired:
+            why = 'give at least one coordinate, such as x = { unit = "m", start = 0.0 }'
+            check.report(("coordinates",), why)
+        raise SceneError(check.problems)
+    return document
 
 
-# --- faults in words ------------------------------------------------------------------------------
+class _Reader:
+    """Converter of trees to tables, that reports faulty entries."""
 
-# keys of other programs and textbooks, and the keys of a scene that they stand for
-ALIASES = {
-    "dt": "h", "step": "h", "time": "duration", "tend": "duration", "t_end": "duration",
-    "initial": "start", "init": "start", "velocity": "rate", "units": "unit", "val": "value",
-    "variables": "coordinates", "params": "parameters", "const": "constants", "x0": "start",
-    "q0": "start", "v0": "rate", "qd0": "rate", "speed": "rate", "t_final": "duration",
-    "tf": "duration", "T_end": "duration", "tmax": "duration", "stepsize": "h", "step_size": "h",
-    "integrator": "method", "solver": "method", "dofs": "coordinates",
-    "range": "limits", "bounds": "limits", "limit": "limits", "saturation": "limits",
-    "T": "kinetic", "K": "kinetic",
-    "V": "potential", "U": "potential", "P": "potential", "R": "dissipation",
-}  # fmt: skip
-ALIASES_OF = {
-    "body": {
-        "origin": "offset", "xyz": "offset", "translation": "offset", "at": "offset",
-        "pos": "position", "rpy": "rotation", "angle": "rotation", "orientation": "rotation",
-        "com": "center", "cog": "center", "centre": "center", "type": "joint", "kind": "joint",
-        "coordinate": "coordinates", "q": "coordinates", "m": "mass", "I": "inertia",
-        "J": "inertia", "moment": "inertia", "c": "damping", "b": "damping", "d": "damping",
-        "mu": "friction", "coulomb": "friction", "width": "friction_width", "motor": "actuator",
-        "torque": "actuator", "force": "actuator", "input": "actuator", "id": "name",
-    },
-    "point": {
-        "parent": "body", "link": "body", "at": "place", "offset": "place", "position": "place",
-        "xyz": "place", "point": "place", "origin": "place", "rpy": "rotation",
-        "angle": "rotation", "orientation": "rotation", "id": "name",
-    },
-    "spring": {
-        "k": "stiffness", "c": "stiffness", "constant": "stiffness", "rest": "length",
-        "l": "length", "l0": "length", "rest_length": "length", "free_length": "length",
-        "torsional": "turning", "angular": "turning", "rotational": "turning",
-        "between": "bodies", "joint": "coordinate", "ends": "points", "anchors": "points",
-    },
-    "damper": {
-        "c": "damping", "b": "damping", "d": "damping", "coefficient": "damping",
-        "torsional": "turning", "angular": "turning", "rotational": "turning",
-        "between": "bodies", "joint": "coordinate", "ends": "points", "anchors": "points",
-    },
-    "force": {
-        "at": "point", "position": "point", "place": "point", "offset": "point", "link": "body",
-        "F": "force", "direction": "force", "moment": "torque", "M": "torque", "axes": "frame",
-    },
-    "loop": {
-        "type": "joint", "kind": "joint", "between": "bodies", "body": "bodies", "point": "points",
-        "anchors": "points", "ends": "points", "axes": "axis", "direction": "axis", "l": "length",
-        "distance": "length", "coordinate": "coordinates", "angle": "rotation", "factor": "ratio",
-        "multiplier": "ratio", "orientation": "rotation", "rpy": "rotation", "id": "name",
-    },
-    "event": {
-        "condition": "when", "function": "when", "if": "when", "expr": "when", "zero": "when",
-        "type": "action", "then": "action", "do": "action", "id": "name",
-    },
-}  # fmt: skip
+    def __init__(self, check: Checker) -> None:
+        self.check = check
 
-_FIRST_KEY = {
-    "coordinates": "start", "inputs": "signal", "outputs": "formula", "constraints": "formula",
-}  # fmt: skip
-_MODELS: Mapping[str, type[_Table]] = {
-    "coordinates": _Coordinate,
-    "parameters": QuantityTable,
-    "constants": QuantityTable,
-    "inputs": _Input,
-    "outputs": OutputTable,
-    "constraints": OutputTable,
-    "energy": _Energy,
-    "body": BodyTable,
-    "point": PointTable,
-    "spring": SpringTable,
-    "damper": DamperTable,
-    "force": ForceTable,
-    "loop": LoopTable,
-    "event": EventTable,
-    "picture": PictureTable,
-    "run": _Run,
-}
+    def table(self, model: Any, tree: Mapping[str, Any], path: Path) -> Any:
+        """Return the table at `path`; faulty entries have their defaults."""
+        known, values = keys(model), dict[str, Any]()
+        jump = "jump" in model.__dataclass_fields__
+        tree = dict(tree) if jump else self._with_intended_keys(known, tree, path)
+        for name, f in zip(known, (f for f in fields(model) if f.metadata), strict=True):
+            here = (*path, name)
+            if name not in tree and f.metadata.get("missing"):
+                self._fault(here, f"missing: {f.metadata['missing']}")
+            elif name in tree:
+                self._add_entry(values, f.name, f.metadata, tree[name], here)
+            if f.name == "name" and len(path) == 2:
+                values.setdefault("name", "_".join(path))
+            elif f.metadata.get("table") and f.name != "picture":
+                values.setdefault(f.name, f.metadata["table"]())
+        if jump:
+            values["jump"] = self._entries(
+                entry, {k: x for k, x in tree.items() if k not in known}, path
+            )
+        if "written" in model.__dataclass_fields__:
+            values["written"] = frozenset(values)
+        return model(**values)
 
+    def _fault(self, path: Path, message: str) -> None:
+        self.check.report(path, message)
+        self.check.repaired.add(path)
 
-def table_at(tree: Any, path: tuple[str, ...]) -> dict[str, Any]:
-    """Return the table (dict) in a tree that the keys `path` lead to, or {} if there is none."""
-    for part in path:
-        tree = tree.get(part) if isinstance(tree, dict) else None
-    return tree if isinstance(tree, dict) else {}
+    def _add_entry(
+        self, values: dict[str, Any], name: str, metadata: Mapping[str, Any], value: Any, path: Path
+    ) -> None:
+        if check := metadata.get("check"):
+            values |= self._entries(check, {path[-1]: value}, path[:-1], name)
+            return
+        if not isinstance(value, dict):
+            self._fault(path, f"'{path[-1]}' is a table: write [{path[-1]}] and its entries below")
+            each = value if isinstance(value, list) else []
+            value = {k: x for one in each if isinstance(one, dict) for k, x in one.items()}
+            if not value:
+                return
+        if model := metadata.get("table"):
+            values[name] = self.table(model, value, path)
+        elif check := metadata.get("entries"):
+            values[name] = dict.fromkeys(value, 0.0) | self._entries(check, value, path)
+        else:
+            values[name] = {k: self._short_table(metadata, x, (*path, k)) for k, x in value.items()}
 
+    def _short_table(self, metadata: Mapping[str, Any], value: Any, path: Path) -> Any:
+        first, name = metadata["first"], path[-1]
+        if not isinstance(value, dict) and metadata["short"]:
+            value = {first: value}
+        elif not isinstance(value, dict):
+            here = short_toml(value) if isinstance(value, (int, float, str)) else "..."
+            self._fault(path, f"'{name}' is a table: write {name} = {{ {first} = {here} }}")
+            value = {}
+        return self.table(metadata["tables"], value, path)
 
-def has_entry(tree: dict[str, Any], path: tuple[str, ...]) -> bool:
-    """Return True if the tree has an entry that the keys `path` lead to."""
-    return path[-1] in table_at(tree, path[:-1])
+    def _entries(
+        self, check: Callable[[object], Any], tree: Mapping[str, Any], path: Path, name: str = ""
+    ) -> dict[str, Any]:
+        """Return the valid ones of some entries, converted. name: another name of the entry."""
+        out = {}
+        for k, value in tree.items():
+            try:
+                out[name or k] = check(value)
+            except ValueError as fault:
+                self._fault((*path, k), str(fault))
+        return out
 
-
-def error_path(error: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the keys that lead to the faulty entry of a pydantic error.
-
-    error: an item of ValidationError.errors(). The name of a union's alternative, which pydantic
-    appends to the keys, is removed.
-    """
-    path = tuple(map(str, error["loc"]))
-    if path[:2] == ("run", "method"):  # whichever of a list
-        return path[:2]
-    branch = path[-1] in ("float", "str") and error["type"] in _UNION_ERRORS
-    return path[:-1] if branch else path
+    def _with_intended_keys(
+        self, known: Sequence[str], tree: Mapping[str, Any], path: Path
+    ) -> dict[str, Any]:
+        """Return the entries of a table; unknown keys are reported, and replaced if possible."""
+        entries_ = {k: x for k, x in tree.items() if k in known}
+        for name, value in tree.items():
+            if name in known:
+                continue
+            intended = _intended_key(known, name, path)
+            what = "table" if isinstance(value, dict) else "key"
+            remedy = (
+                f"; did you mean '{intended}'?" if intended else f": known are {', '.join(known)}"
+            )
+            if path == ("energy",) and name in hints.LAGRANGIANS:
+                remedy = f": {hints.GIVE_ENERGIES}"
+            self.check.report((*path, name), f"unknown {what} '{name}'{remedy}")
+            if intended and intended not in entries_:
+                entries_[intended] = value
+                self.check.places.rename((*path, name), (*path, intended))
+            elif isinstance(value, dict):
+                self.check.kinds |= dict.fromkeys(value, frozenset({UNKNOWN}))
+        return entries_
 
 
-_UNION_ERRORS = ("float_type", "string_type", "finite_number")
-
-
-def _keys(path: tuple[str, ...]) -> list[str]:
-    """Return the keys that are allowed beside the last one of `path`."""
-    model = _MODELS[path[0]] if len(path) > 1 else Document
-    return [field.alias or name for name, field in model.model_fields.items()]
-
-
-def intended_key(path: tuple[str, ...]) -> str:
-    """Return the valid key that was probably meant by an unknown key, or "".
-
-    path: the keys that lead to the unknown key, which is the last of them.
-    """
-    known, last = _keys(path), path[-1]
-    alias = ALIASES_OF.get(path[0], {}).get(last, "") if len(path) > 2 else ""
-    alias = alias or ALIASES.get(last, "")
-    near = alias if alias in known else nearest(path[-1], known)
+def _intended_key(known: Sequence[str], name: str, path: Path) -> str:
+    """Return the key that was probably meant by an unknown key, or ""."""
+    alias = hints.KEYS_OF_ARRAYS.get(path[0], {}).get(name, "") if len(path) > 1 else ""
+    alias = alias or hints.KEYS.get(name, "")
+    near = alias if alias in known else nearest(name, known)
     # a table's entries are judged by what it is taken for: 'damping' is no 'spring'
-    is_unrelated = len(path) == 1 and near != alias and not nearest(path[-1], [near], 0.7)
+    is_unrelated = not path and near != alias and not nearest(name, [near], 0.7)
     return "" if is_unrelated else near
-
-
-def explain(error: Mapping[str, Any], path: tuple[str, ...]) -> str:
-    """Return the message, with a remedy, for a pydantic error in the layout of a scene.
-
-    error: an item of ValidationError.errors(). path: the keys that lead to the faulty entry.
-    """
-    kind, received, last = str(error["type"]), error.get("input"), path[-1]
-    here = short_toml(received)
-    if kind == "missing":
-        where = (path[0], last) if path[0] in ALIASES_OF else path
-        return "missing: " + _MISSING.get(where, f"add {last} = ...")
-    if kind == "value_error":
-        return str(error["ctx"]["error"])
-    if (
-        kind == "extra_forbidden"
-        and path[0] == "energy"
-        and last in ("lagrangian", "Lagrangian", "L")
-    ):
-        return (
-            f"unknown key '{last}': give L = K - P as kinetic = K and potential = P, where the "
-            "potential can have terms linear in the velocities"
-        )
-    if kind == "extra_forbidden":
-        near = intended_key(path)
-        remedy = f"; did you mean '{near}'?" if near else f": known are {', '.join(_keys(path))}"
-        return f"unknown {'table' if isinstance(received, dict) else 'key'} '{last}'{remedy}"
-    if path == ("eomc",):
-        return f"format {here} is not known to this version, which reads eomc = 1"
-    if kind == "too_short":
-        return 'none is declared: add at least one, such as x = { unit = "m", start = 0.0 }'
-    if path[:2] == ("run", "method"):
-        return f"unknown method {here}: known are {', '.join(_NAMES)}"
-    if path in (("run", "real"), ("run", "friction")):
-        what, words = ("type", REALS) if last == "real" else ("friction", FRICTIONS)
-        return f"unknown {what} {here}: known are {', '.join(words)}"
-    if path[0] == "event" and last in ("direction", "action"):
-        known = DIRECTIONS if last == "direction" else ACTIONS
-        return f"unknown {last} {here}: known are {', '.join(known)}"
-    if path == ("run", "tolerance"):
-        return f"must be a number from 1e-15 to 1e-2, here {here}"
-    if kind == "greater_than":
-        return f"must be greater than zero, here {here}"
-    if kind == "finite_number":
-        return f"must be a finite number, here {here}"
-    if kind in ("dict_type", "model_type", "model_attributes_type"):
-        if len(path) == 1:
-            return f"'{last}' is a table: write [{last}] and its entries below"
-        key = _FIRST_KEY.get(path[0], "value")
-        value = here if isinstance(received, (int, float, str)) else "..."
-        return f"'{last}' is a table: write {last} = {{ {key} = {value} }}"
-    if kind == "bool_type":
-        return f"must be true or false, here {here}"
-    if path[0] == "run":
-        return f"must be a number, here {here}{messages.number_remedy(received)}"
-    if last == "frame":
-        return f'must be "world" or "body", whose axes the entries are along, here {here}'
-    if last in ("unit", "note", "name", "title", "parent", "joint", "coordinate"):
-        return f"must be text in quotes, here {here}"
-    return f"must be a number or a formula in quotes, here {here}"
-
-
-_MISSING: Mapping[tuple[str, ...], str] = {
-    ("eomc",): "begin the scene with eomc = 1, its format",
-    ("name",): 'add name = "...", which names the module and begins every C symbol',
-    ("coordinates",): 'add [coordinates] with entries such as x = { unit = "m", start = 0.0 }',
-    ("energy",): 'add [energy] with kinetic = "..." and potential = "..."',
-    ("energy", "kinetic"): 'add kinetic = "..."',
-    ("body", "name"): 'give the body a name: name = "..."',
-    ("point", "name"): 'give the point a name: name = "..."',
-    ("point", "body"): 'name the body that it is fixed to: body = "..."',
-    ("spring", "stiffness"): 'add stiffness = "..."',
-    ("damper", "damping"): 'add damping = "..."',
-    ("loop", "name"): 'give the loop a name: name = "..."',
-    ("loop", "joint"): 'say what closes it: joint = "revolute" or another',
-    ("event", "name"): 'give the event a name: name = "..."',
-    ("event", "when"): 'add when = "...", whose zeros are the event',
-    ("force", "body"): 'name the body that it acts on, body = "..."; a force along a coordinate '
-    'stands in [forces], x = "F - b*x_dot"',
-}
-
-
-_REQUIRED = ("name", "stiffness", "damping", "when")  # keys of entries of arrays
-
-
-def repair(tree: dict[str, Any], path: tuple[str, ...]) -> None:
-    """Replace the faulty entry at `path` in the tree by a valid one, or remove it.
-
-    The tree is changed so that all other entries can be checked; the error is reported elsewhere.
-    """
-    table, last = table_at(tree, path[:-1]), path[-1]
-    value = table.get(last)
-    if len(path) == 1 and isinstance(value, list) and all(isinstance(g, dict) for g in value):
-        table[last] = {key: value for g in value for key, value in g.items()}  # [[parameters]]
-    elif path in _PLACEHOLDERS:
-        table[last] = _PLACEHOLDERS[path]
-    elif len(path) == 3 and last in _REQUIRED:
-        table[last] = f"{path[0]}_{path[1]}" if last == "name" else 1.0
-    elif path[0] == "loop" and last == "joint":
-        table[last] = ""
-    elif len(path) == 3 and last == "body" and path[0] in ("force", "point"):
-        bodies = table_at(tree, ("body",))  # where there are none, no table
-        table[last] = next((table_at(bodies, (b,)).get("name", b) for b in bodies), "world")
-    elif len(path) == 2 and path[0] in ("definitions", "forces"):
-        table[last] = "0"
-    elif len(path) == 2 and path[0] in ("coordinates", "inputs"):
-        table[last] = {}
-    elif last in ("value", "formula"):
-        table_at(tree, path[:1])[path[1]] = 1.0
-    else:
-        table.pop(last, None)
-
-
-_PLACEHOLDERS: Mapping[tuple[str, ...], Any] = {
-    ("eomc",): 1,
-    ("name",): "scene",
-    ("energy",): {"kinetic": "0"},
-    ("energy", "kinetic"): "0",
-}

@@ -9,10 +9,12 @@ from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping
 from graphlib import CycleError, TopologicalSorter
 
+from eomc.base import names
 from eomc.base.errors import Problem
-from eomc.scene import formulas, messages
-from eomc.scene.formulas import Formula, FormulaError, suggest
-from eomc.scene.source_map import SourceMap
+from eomc.runtime.mathematics import FUNCTIONS
+from eomc.scene import formulas, hints
+from eomc.scene.formulas import Formula, FormulaError, Value, suggest
+from eomc.scene.toml_text import SourceMap
 
 # kinds of quantities that a formula can depend on; after an error the kind is unknown
 TIME, INPUT, POSITION, VELOCITY = "the time", "inputs", "coordinates", "velocities"
@@ -22,6 +24,7 @@ UNKNOWN = "something faulty"
 NOTHING: frozenset[str] = frozenset()
 
 # names that outputs can use besides all others, unless the scene declares them
+JUMPS = tuple(f.name for f in FUNCTIONS.values() if f.shape == "jump")
 ENERGIES = ("kinetic_energy", "potential_energy", "energy")
 
 MAX_SUGGESTIONS = 20  # similar names are suggested for the first errors only
@@ -48,7 +51,8 @@ def value_of(formula: Formula, known: Mapping[str, float]) -> tuple[float, str]:
         fault = "has no real value"
     values = {n.id: known[n.id] for n in formula.names()}
     where = ", ".join(f"{name} = {value:g}" for name, value in values.items())
-    return math.nan, f"'{formula.shown}' {fault}" + (f" at {where}" if where else "")
+    advice = formulas.domain_advice(formula, known.__getitem__)
+    return math.nan, f"'{formula.shown}' {fault}" + (f" at {where}" if where else "") + advice
 
 
 def find_cycles(graph: dict[str, list[str]]) -> Iterator[list[str]]:
@@ -61,9 +65,9 @@ def find_cycles(graph: dict[str, list[str]]) -> Iterator[list[str]]:
         try:
             return TopologicalSorter(graph).prepare()
         except CycleError as cycle:
-            names = cycle.args[1][::-1]
-            yield names
-            graph |= {name: [] for name in names}
+            ring = cycle.args[1][::-1]
+            yield ring
+            graph |= {name: [] for name in ring}
 
 
 def cycle_text(cycle: list[str]) -> str:
@@ -133,12 +137,36 @@ class Checker:
             self.reported.add(same)
             self.problems.append(self.places.problem(path, message, at, text, severity))
 
-    def parse(self, path: Path, value: float | str) -> Formula | None:
+    def report_missing(self, path: Path, remedy: str) -> None:
+        """Add an error for a missing entry at `path`, unless an error was reported for it before.
+
+        remedy: end of the message.
+        """
+        if path not in self.repaired:
+            self.report(path, f"missing: {remedy}")
+
+    def claim(self, path: Path, name: str, taken: dict[str, str], what: str) -> bool:
+        """Report an error if a name is not valid or is in use; else add it to `taken`.
+
+        path: keys of the entry that declares the name. taken: words on what has each name in use,
+        such as "is the time". what: these words for this name. Returns True without an error.
+        """
+        why = names.fault(name)
+        if not why and name in taken:
+            why = f"'{name}' {taken[name]}: choose another name"
+        if why:
+            self.report(path, why, text=name if path[-1] == "name" else None)
+        taken.setdefault(name, what)
+        return not why
+
+    def parse(self, path: Path, value: Value) -> Formula | None:
         """Parse an entry of the scene and return its formula, without checking its names.
 
-        path: keys of the entry. value: the entry, a number or the text of a formula. If the syntax
-        of the formula is not permitted, report the error and return None.
+        path: keys of the entry. value: the entry. If the syntax of the formula is not permitted,
+        report the error and return None.
         """
+        if isinstance(value, Formula):
+            return value
         text = value if isinstance(value, str) else repr(value)
         if re.search(r"[\t\n]", text) and re.search(r"\\[tn]", self.places.source(path)):
             # "\theta" is a tab and 'heta', "\nu" a line break and 'u'
@@ -149,7 +177,7 @@ class Checker:
         except FormulaError as fault_found:
             # a parameter is no product of others: "2 m" is a length
             declared = () if path[0] in ("parameters", "constants") else {*self.tables, *self.kinds}
-            remedy = messages.quantity_remedy(text, declared)
+            remedy = hints.quantity_remedy(text, declared)
             fault = FormulaError(remedy, 0, len(text)) if remedy else fault_found
             self.report(path, fault.message, fault, text)
             return None
@@ -157,7 +185,7 @@ class Checker:
     def formula(
         self,
         path: Path,
-        value: float | str,
+        value: Value,
         allowed: Collection[str] | None = None,
         rule: str = "",
     ) -> Formula | None:
@@ -216,7 +244,7 @@ class Checker:
                 return f"{start}: nobody knows the rate of an input; add it as a further input"
             case "parameters" | "constants" as table:
                 return f"{start}: '{owner}' stands in [{table}], so it doesn't move"
-        if similar := self._similar_name(name) or messages.intended_velocity(name, self.tables):
+        if similar := self._similar_name(name) or hints.intended_velocity(name, self.tables):
             return f"{start}; did you mean '{similar}'?"
         if name == "time":
             return f"{start}; did you mean 't'?"
@@ -270,6 +298,16 @@ class Checker:
         parts_of_kind = [part for part in parts if kind in self.kinds_of(part)]
         return min(parts_of_kind, key=lambda part: part.col_offset, default=formula.tree)
 
+    def depends_on(self, path: Path, formula: Formula, kind: str, why: str) -> bool:
+        """Return whether a formula depends on a kind of quantities, such as VELOCITY; report it.
+
+        path: keys of the formula's entry in the scene. why: the message.
+        """
+        depends = kind in self.kinds_of(formula.tree)
+        if depends:
+            self.report(path, why, self.find_part(formula, kind), formula.text)
+        return depends
+
     def number(self, path: Path, formula: Formula | None, known: Mapping[str, float]) -> float:
         """Return the value of a formula.
 
@@ -294,7 +332,7 @@ class Checker:
         visited: set[str] = set()
         while queue:
             where, f = queue.pop()
-            for call in f.calls("sign", "heaviside"):
+            for call in f.calls(*JUMPS):
                 if {TIME, POSITION, VELOCITY} & self.kinds_of(call):
                     function = ast.unparse(call.func)
                     self.report(

@@ -10,9 +10,9 @@ from typing import Any
 
 from eomc.base import names
 from eomc.base.errors import SceneError
-from eomc.scene.assembly import WORLD, Assembly, Damper, Force, LoopJoint, RigidBody, Spring, Vector
-from eomc.scene.formulas import Formula, nearest, suggest
-from eomc.scene.joints import CLOSING_ALIASES, CLOSINGS, JOINT_ALIASES, JOINTS, Z
+from eomc.scene.formulas import Formula, Value
+from eomc.scene.joints import CLOSINGS, JOINTS
+from eomc.scene.scene import WORLD, Assembly, Damper, Force, LoopJoint, RigidBody, Spring, Vector
 from eomc.scene.schema import (
     BodyTable,
     DamperTable,
@@ -22,12 +22,19 @@ from eomc.scene.schema import (
     PointTable,
     SpringTable,
 )
-from eomc.scene.scope import Checker, Path, cycle_text, find_cycles
-from eomc.scene.validate_tables import FRICTION_WIDTH, check_width, row_name_fault
-from eomc.scene.validate_values import ORIGIN, ZERO, ValueChecker
+from eomc.scene.scope import Path, cycle_text, find_cycles
+from eomc.scene.validate_tables import (
+    FRICTION_WIDTH,
+    ORIGIN,
+    WORLD_TAKEN,
+    ZERO,
+    ValueChecker,
+    check_width,
+    names_taken_from_rows,
+)
 
 _JOINT_KEYS = (
-    "parent", "coordinates", "axis", "offset", "center", "armature", "damping", "friction",
+    "parent", "coordinates", "axis", "pitch", "offset", "center", "armature", "damping", "friction",
     "friction_width", "actuator",
 )  # fmt: skip
 
@@ -44,12 +51,13 @@ def center_names(doc: Document) -> set[str]:
     return {f"{name}_{letter}" for name in named for letter in letters}
 
 
-def assemble(check: Checker, doc: Document, known: Mapping[str, float]) -> Assembly | None:
+def assemble(check: ValueChecker) -> Assembly | None:
     """Check the bodies, points, springs, dampers, forces and loops of a scene and return them.
 
-    known: values of constants and parameters by name. Errors are reported to `check`; after an
-    error the result must not be used. Returns None if the scene has no such tables.
+    Errors are reported to `check`; after an error the result must not be used. Returns None if the
+    scene has no such tables.
     """
+    doc = check.doc
     if not (doc.body or doc.point or doc.spring or doc.damper or doc.force or doc.loop):
         if doc.gravity is not None:
             check.report(
@@ -58,21 +66,20 @@ def assemble(check: Checker, doc: Document, known: Mapping[str, float]) -> Assem
                 "into the potential energy",
             )
         return None
-    return _Bodies(check, doc, known).assembly()
+    return _Bodies(check).assembly()
 
 
 class _Bodies:
-    def __init__(self, check: Checker, doc: Document, known: Mapping[str, float]) -> None:
-        self.check, self.doc = check, doc
-        self.values = ValueChecker(check, doc, known)
-        self.joints = JointChecker(self.values)
+    def __init__(self, check: ValueChecker) -> None:
+        self.check, self.doc = check, check.doc
+        self.joints = JointChecker(check)
         self.bodies: dict[str, RigidBody] = {}
 
     def assembly(self) -> Assembly:
         """Check all tables of bodies and what acts on them, and return the assembly."""
         gravity = self._gravity()
         self._check_names()
-        for name, path in self.values.names.items():
+        for name, path in self.check.body_paths.items():
             entry = self.joints.entry(name)
             if isinstance(entry, PointTable):
                 self._check_point(path, entry)
@@ -83,13 +90,13 @@ class _Bodies:
         self._check_shared_coordinates()
         ordered = self._sorted_bodies()
         self._check_inertia(ordered)
-        springs = [check_spring(self.values, ("spring", k), e) for k, e in self.doc.spring.items()]
-        dampers = [check_damper(self.values, ("damper", k), e) for k, e in self.doc.damper.items()]
-        forces = [check_force(self.values, ("force", k), e) for k, e in self.doc.force.items()]
-        loop_checker = LoopChecker(self.values)
+        springs = [check_spring(self.check, ("spring", k), e) for k, e in self.doc.spring.items()]
+        dampers = [check_damper(self.check, ("damper", k), e) for k, e in self.doc.damper.items()]
+        forces = [check_force(self.check, ("force", k), e) for k, e in self.doc.force.items()]
+        loop_checker = LoopChecker(self.check)
         loops = [loop_checker.loop(("loop", k), e) for k, e in self.doc.loop.items()]
         return Assembly(
-            plane=self.values.dimension == 2,
+            plane=self.check.dimension == 2,
             gravity=gravity,
             bodies=tuple(ordered),
             springs=tuple(springs),
@@ -104,42 +111,33 @@ class _Bodies:
         entries = self.doc.gravity
         if entries is None:
             if self.doc.body:
-                self.values.dimension = None
-                if ("gravity",) not in self.check.repaired:
-                    self.check.report(
-                        ("gravity",),
-                        'missing: add gravity = [0, "-9.81"] above the first [table] for a plane '
-                        'scene, [0, 0, "-9.81"] for one in space, [0, 0] or [0, 0, 0] for none',
-                    )
+                self.check.dimension = None
+                self.check.report_missing(
+                    ("gravity",),
+                    'add gravity = [0, "-9.81"] above the first [table] for a plane '
+                    'scene, [0, 0, "-9.81"] for one in space, [0, 0] or [0, 0, 0] for none',
+                )
             return ORIGIN
         if len(entries) not in (2, 3):
-            self.values.dimension = None
+            self.check.dimension = None
             self.check.report(
                 ("gravity",),
                 f"has two entries in a plane scene and three in space, here {len(entries)}",
             )
             return ORIGIN
-        self.values.dimension = len(entries)
-        return self.values.vector(("gravity",), entries)
+        self.check.dimension = len(entries)
+        return self.check.vector(("gravity",), entries)
 
     def _check_names(self) -> None:
         """Store the place of each body and point by its name; report names that can't be used."""
         entries = [(("body", label), entry.name) for label, entry in self.doc.body.items()]
         entries += [(("point", label), entry.name) for label, entry in self.doc.point.items()]
+        taken = dict(WORLD_TAKEN)
         for place, name in entries:
-            path = (*place, "name")
-            if why := names.fault(name):
-                self.check.report(path, why)
-            elif name == WORLD:
-                self.check.report(
-                    path, "'world' is the frame that does not move: name the body otherwise"
-                )
-                continue
-            elif name in self.values.names:
-                what = f"{self.values.names[name][0]} above"
-                self.check.report(path, f"'{name}' is the name of a {what}: rename one of the two")
-                continue
-            self.values.names[name] = place
+            what = f"is the name of a {place[0]} already"
+            self.check.claim((*place, "name"), name, taken, what)
+            if name != WORLD:
+                self.check.body_paths.setdefault(name, place)
         for name in sorted(self.check.centers & {*self.check.tables}):
             body = name[:-2]
             self.check.report(
@@ -167,31 +165,31 @@ class _Bodies:
                 )
                 remedy = ", and let forces act through [forces]" if key == "actuator" else ""
                 self.check.report((*path, key), f"{why}: remove '{key}'{remedy}")
-        mass, inertia = self.values.mass(path, entry)
+        mass, inertia = self.check.mass(path, entry)
         self.bodies[entry.name] = RigidBody(
             name=entry.name,
             mass=mass,
             inertia=inertia,
             center=ORIGIN,
-            rotation=self.values.rotation(
-                (*path, "rotation"), entry.rotation, self.values.position_formula
+            rotation=self.check.rotation(
+                (*path, "rotation"), entry.rotation, self.check.position_formula
             ),
-            position=self.values.vector(
-                (*path, "position"), entry.position, self.values.position_formula
+            position=self.check.vector(
+                (*path, "position"), entry.position, self.check.position_formula
             ),
             note=entry.note,
         )
 
     def _center_text(self, name: str) -> str:
-        point = self.values.names.get(name, ("body",))[0] == "point"
+        point = self.check.body_paths.get(name, ("body",))[0] == "point"
         return f"point '{name}'" if point else f"the centre of mass of body '{name}'"
 
     def _check_point(self, path: Path, entry: PointTable) -> None:
         """Check a [[point]], which is a massless body on a fixed joint."""
-        place = self.values.vector((*path, "place"), entry.place)
-        rotation = self.values.rotation((*path, "rotation"), entry.rotation, self.values.formula)
+        place = self.check.vector((*path, "place"), entry.place)
+        rotation = self.check.rotation((*path, "rotation"), entry.rotation)
         parent = self.joints.parent((*path, "body"), entry.name, entry.body)
-        self.values.has_inertia[entry.name] = False
+        self.check.has_inertia[entry.name] = False
         if parent is not None:
             self.bodies[entry.name] = RigidBody(
                 name=entry.name,
@@ -211,14 +209,15 @@ class _Bodies:
         check = self.check
         joint = self.joints.kind(path, entry)
         parent = self.joints.parent((*path, "parent"), entry.name, entry.parent)
-        mass, inertia = self.values.mass(path, entry)
-        center = self.values.vector((*path, "center"), entry.center)
-        offset = self.values.vector((*path, "offset"), entry.offset)
-        rotation = self.values.rotation((*path, "rotation"), entry.rotation, self.values.formula)
+        mass, inertia = self.check.mass(path, entry)
+        center = self.check.vector((*path, "center"), entry.center)
+        offset = self.check.vector((*path, "offset"), entry.offset)
+        rotation = self.check.rotation((*path, "rotation"), entry.rotation)
         if not joint:
             return
         coordinates = self.joints.coordinates((*path, "coordinates"), joint, entry)
         axes = self.joints.axes((*path, "axis"), joint, entry)
+        pitch = self.joints.pitch((*path, "pitch"), joint, entry)
         per_coordinate: dict[str, Any] = {
             key: self.joints.per_coordinate((*path, key), joint, getattr(entry, key))
             for key in ("armature", "damping", "friction", "actuator")
@@ -227,8 +226,7 @@ class _Bodies:
         if per_coordinate["friction"]:
             width = FRICTION_WIDTH
         if entry.friction_width is not None:
-            width, value = self.values.value((*path, "friction_width"), entry.friction_width)
-            check_width(check, path, value, width, entry.friction)
+            width = check_width(check, path, entry.friction_width, entry.friction)
         if parent is None or coordinates is None:
             return
         self.bodies[entry.name] = RigidBody(
@@ -241,6 +239,7 @@ class _Bodies:
             joint=joint,
             coordinates=coordinates,
             axes=axes,
+            pitch=pitch,
             offset=offset,
             friction_width=width,
             note=entry.note,
@@ -256,7 +255,7 @@ class _Bodies:
                 first = self.joints.first_body.get(text, body.name)
                 if first != body.name:
                     self.check.report(
-                        (*self.values.names[body.name], "coordinates"),
+                        (*self.check.body_paths[body.name], "coordinates"),
                         f"'{text}' moves the joint of '{first}' already, and '{idle[0]}' moves "
                         f"none; did you mean '{idle[0]}'?",
                         text=text,
@@ -268,7 +267,7 @@ class _Bodies:
         """Return the bodies, parents before children, else in their order; cycles are reported."""
         graph = {name: [b.parent] if b.joint else [] for name, b in self.bodies.items()}
         for ring in islice(find_cycles(graph), SceneError.MAX_SHOWN):
-            place = self.values.names[ring[0]]
+            place = self.check.body_paths[ring[0]]
             self.check.report(
                 (*place, "body" if place[0] == "point" else "parent"),
                 f"the parents form a loop: {cycle_text(ring)}; let one of them be held by the "
@@ -299,7 +298,7 @@ class _Bodies:
         rows = self.doc.loop or self.doc.constraints
         if self.doc.energy.kinetic != 0.0 or rows or any(body.position for body in ordered):
             return
-        carries = dict(self.values.has_inertia)
+        carries = dict(self.check.has_inertia)
         for body in reversed(ordered):
             if body.parent in carries:
                 carries[body.parent] |= carries[body.name]
@@ -316,7 +315,7 @@ class _Bodies:
             resisted |= moved  # once
             by = " and ".join(formula.text for formula in body.coordinates)
             self.check.report(
-                self.values.names[body.name],
+                self.check.body_paths[body.name],
                 f"nothing that {by} would move has mass or inertia: "
                 f"give '{body.name}' a mass, or its joint an armature",
             )
@@ -331,14 +330,13 @@ class JointChecker:
     A path is the tuple of keys of an entry in the scene, such as ("body", "arm", "joint").
     """
 
-    def __init__(self, values: ValueChecker) -> None:
-        self.values = values
-        self.check, self.doc = values.check, values.doc
+    def __init__(self, check: ValueChecker) -> None:
+        self.check, self.doc = check, check.doc
         self.first_body: dict[str, str] = {}  # first body that each coordinate moves
 
     def entry(self, name: str) -> BodyTable | PointTable:
         """Return the table in the scene of the body or point `name`."""
-        array, label = self.values.names[name]
+        array, label = self.check.body_paths[name]
         entries: Mapping[str, BodyTable | PointTable] = getattr(self.doc, array)
         return entries[label]
 
@@ -348,31 +346,15 @@ class JointChecker:
         path: keys of the body. entry: its table. If the kind is missing or unknown, or does not
         exist in plane scenes, report this and return "".
         """
-        check, joint = self.check, entry.joint
-        known = [k for k, kind in JOINTS.items() if kind.plane or self.values.dimension != 2]
-        if joint is None:
-            if {(*path, "joint"), (*path, "position")} & check.repaired:
-                return ""  # reported already
-            check.report(
+        if entry.joint is not None:
+            return self.check.kind(path, entry.joint, JOINTS, "moves a body")
+        if not {(*path, "joint"), (*path, "position")} & self.check.repaired:  # reported already
+            self.check.report(
                 path,
                 'say how the body is held: joint = "revolute" or another, or position = [...] with '
                 "formulas in the coordinates",
             )
-            return ""
-        if joint not in JOINTS:
-            near = JOINT_ALIASES.get(joint.lower(), "") or nearest(joint, JOINTS)
-            remedy = f"; did you mean '{near}'?" if near else f": known are {', '.join(known)}"
-            check.report((*path, "joint"), f"there is no joint '{joint}'{remedy}", text=joint)
-            return ""
-        if joint not in known:
-            check.report(
-                (*path, "joint"),
-                f"a {joint} joint moves in space, and gravity has two entries, so the scene is "
-                f"plane: give gravity a third, or use {', '.join(known)}",
-                text=joint,
-            )
-            return ""
-        return joint
+        return ""
 
     def parent(self, path: Path, name: str, parent: str | None) -> str | None:
         """Check the parent of the body `name` and return it, "world" if it is not given.
@@ -381,10 +363,9 @@ class JointChecker:
         """
         if parent is None or parent == WORLD:
             return WORLD
-        if parent not in self.values.names:
-            remedy = suggest(parent, [WORLD, *self.values.names]) or ": declare it as a [[body]]"
-            self.check.report(path, f"there is no body '{parent}'{remedy}", text=parent)
-        elif parent == name:
+        if not self.check.is_body(path, parent):
+            return None
+        if parent == name:
             self.check.report(
                 path, f"'{parent}' is its own parent: name another body, or world", text=parent
             )
@@ -427,16 +408,10 @@ class JointChecker:
     def _coordinate(self, path: Path, text: str) -> Formula | None:
         """Return a checked coordinate or formula of coordinates; None after an error."""
         check, coordinates = self.check, self.doc.coordinates
-        if text.isidentifier() and text not in coordinates:
-            table = check.tables.get(text)
-            near = suggest(text, coordinates) or ": add it to [coordinates]"
-            why = f"'{text}' is not a coordinate{near}"
-            if table:
-                why = f"'{text}' stands in [{table}]: a joint moves by what is in [coordinates]"
-            check.report(path, why, text=text)
+        if text.isidentifier() and not self.check.is_coordinate(path, text):
             return None
         rule = "a joint moves by coordinates, or formulas of coordinates, parameters and constants"
-        formula = check.formula(path, text, {*self.values.known, *coordinates}, rule)
+        formula = check.formula(path, text, {*self.check.known, *coordinates}, rule)
         if formula is None:
             return None
         fault = ""
@@ -462,34 +437,32 @@ class JointChecker:
 
         joint: kind of the joint. If no axes are given, return its defaults. Errors are reported.
         """
-        check, axis_count = self.check, JOINTS[joint].axis_count
-        if path in check.repaired or self.values.dimension is None:
-            return ()
-        written = entry.axis
-        if written is None:
-            if axis_count and not JOINTS[joint].defaults:
-                example = "[1, 0]" if self.values.dimension == 2 else "[1, 0, 0]"
-                check.report(path, f"missing: a {joint} joint slides along one, axis = {example}")
-                return (Z,) * axis_count
-            return JOINTS[joint].defaults
-        if not axis_count:
-            check.report(path, f"a {joint} joint has no axis to choose: remove it")
-            return ()
-        if joint == "revolute" and self.values.dimension == 2:
-            check.report(path, "in a plane scene joints turn about z: remove it")
-            return ()
-        if len(written) != axis_count:
-            count = "one axis" if axis_count == 1 else "two axes, such as [[1, 0, 0], [0, 1, 0]]"
-            check.report(path, f"a {joint} joint has {count}, here {len(written)}")
-            return ()
-        axes = [names_used for axis in written if (names_used := self.values.unit(path, axis))]
-        if len(axes) < len(written):
-            return ()
+        count = JOINTS[joint].axis_count
+        if joint == "revolute" and self.check.dimension == 2:
+            count = 0
+        words = ("", "one axis", "two axes, such as [[1, 0, 0], [0, 1, 0]]")
+        counts = {count: words[count]} if count else {}
+        axes = self.check.axes(path, joint, entry.axis, counts, JOINTS[joint].defaults)
         if len(axes) == 2 and abs(sum(a * b for a, b in zip(*axes, strict=True))) > 1 - 1e-9:
-            check.report(
-                path, "the two axes are parallel, so the two angles are one: turn one of them"
+            why = "the two axes are parallel, so the two angles are one: turn one of them"
+            self.check.report(path, why)
+        return axes
+
+    def pitch(self, path: Path, joint: str, entry: BodyTable) -> Formula | None:
+        """Check the entry `pitch` of a body and return its formula; None for most joints.
+
+        Only screw joints have a pitch, in m/rad. joint: kind of the joint. Errors are reported.
+        """
+        if JOINTS[joint].has_pitch and entry.pitch is not None:
+            return self.check.parameter_formula(path, entry.pitch)
+        if JOINTS[joint].has_pitch:
+            why = "what it moves along its axis for each radian, in m"
+            self.check.report_missing(
+                path, f'a {joint} joint has one, {why}: pitch = "lead/(2*pi)"'
             )
-        return tuple(axes)
+        elif entry.pitch is not None:
+            self.check.report(path, f"a {joint} joint has no pitch: remove it")
+        return None
 
     def per_coordinate(self, path: Path, joint: str, written: Any) -> tuple[Formula, ...]:
         """Check an entry with one value for each coordinate of a joint, such as `damping`.
@@ -512,59 +485,54 @@ class JointChecker:
             return ()
         if key == "actuator":
             return tuple(self.check.formula(path, entry) or ZERO for entry in entries)
-        checked = [self.values.value(path, entry) for entry in entries]
-        for formula, value in checked:
-            if value < 0 and key != "damping":
-                self.check.report(path, f"is {value:g}, and can't be negative", text=formula.text)
-                break
-        return tuple(formula for formula, _ in checked)
+        checked = {x: self.check.value(path, x, key != "damping")[0] for x in {*entries}}
+        return tuple(checked[x] for x in entries)
 
 
 # --- springs, dampers and forces ------------------------------------------------------------------
 
 
-def check_spring(values: ValueChecker, path: Path, entry: SpringTable) -> Spring:
+def check_spring(check: ValueChecker, path: Path, entry: SpringTable) -> Spring:
     """Check a [[spring]] table and return the spring.
 
-    path: keys of the table in the scene. entry: the table. Errors are reported to `values.check`.
+    path: keys of the table in the scene. entry: the table. Errors are reported to `check`.
     """
     return Spring(
-        stiffness=values.formula((*path, "stiffness"), entry.stiffness),
-        length=values.formula((*path, "length"), entry.length),
-        **_attachment(values, path, entry),
+        stiffness=check.parameter_formula((*path, "stiffness"), entry.stiffness),
+        length=check.parameter_formula((*path, "length"), entry.length),
+        **_attachment(check, path, entry),
     )
 
 
-def check_damper(values: ValueChecker, path: Path, entry: DamperTable) -> Damper:
+def check_damper(check: ValueChecker, path: Path, entry: DamperTable) -> Damper:
     """Check a [[damper]] table and return the damper.
 
-    path: keys of the table in the scene. entry: the table. Errors are reported to `values.check`.
+    path: keys of the table in the scene. entry: the table. Errors are reported to `check`.
     """
     return Damper(
-        damping=values.formula((*path, "damping"), entry.damping),
-        **_attachment(values, path, entry),
+        damping=check.parameter_formula((*path, "damping"), entry.damping),
+        **_attachment(check, path, entry),
     )
 
 
-def check_force(values: ValueChecker, path: Path, entry: ForceTable) -> Force:
+def check_force(check: ValueChecker, path: Path, entry: ForceTable) -> Force:
     """Check a [[force]] table and return the force and torque that it applies to a body.
 
     path: keys of the table in the scene. entry: the table. The formulas of force and torque may use
-    all names. Errors are reported to `values.check`.
+    all names. Errors are reported to `check`.
     """
-    check = values.check
-    if entry.body not in values.names:
-        remedy = suggest(entry.body, values.names) or ": declare it as a [[body]]"
-        if entry.body == WORLD:
-            remedy = ": what does not move needs no force"
-        check.report((*path, "body"), f"there is no body '{entry.body}'{remedy}", text=entry.body)
+    if (*path, "body") in check.repaired:  # reported already
+        pass
+    elif check.is_body((*path, "body"), entry.body) and entry.body == WORLD:
+        why = "what does not move needs no force: remove it"
+        check.report((*path, "body"), why, text=WORLD)
     if entry.force is None and entry.torque is None:
-        example = '[0, "F"]' if values.dimension == 2 else '[0, 0, "F"]'
+        example = '[0, "F"]' if check.dimension == 2 else '[0, 0, "F"]'
         check.report(path, f"gives neither a force nor a torque: add force = {example}")
     if entry.point is not None and entry.force is None:
         check.report((*path, "point"), "a torque acts on the whole body: remove it")
     torque = entry.torque
-    if values.dimension == 2 and torque is not None:
+    if check.dimension == 2 and torque is not None:
         if isinstance(torque, tuple):
             check.report((*path, "torque"), 'in a plane scene it is one formula, torque = "M"')
         torque = (0.0, 0.0, torque) if not isinstance(torque, tuple) else None
@@ -573,31 +541,31 @@ def check_force(values: ValueChecker, path: Path, entry: ForceTable) -> Force:
         torque = None
     return Force(
         body=entry.body,
-        point=values.vector((*path, "point"), entry.point),
-        force=_world_vector(values, (*path, "force"), entry.force),
-        torque=_world_vector(values, (*path, "torque"), torque, wide=3),
+        point=check.vector((*path, "point"), entry.point),
+        force=_world_vector(check, (*path, "force"), entry.force),
+        torque=_world_vector(check, (*path, "torque"), torque, wide=3),
         in_body=entry.frame == "body",
     )
 
 
 def _world_vector(
-    values: ValueChecker,
+    check: ValueChecker,
     path: Path,
-    entries: tuple[float | str, ...] | None,
+    entries: tuple[Value, ...] | None,
     wide: int | None = None,
 ) -> Vector:
     """Return three checked formulas, which may use all names."""
-    if entries is None or not (wide == len(entries) or values.fits(path, len(entries))):
+    if entries is None or not (wide == len(entries) or check.fits(path, len(entries))):
         return ORIGIN
-    x, y, *third = (values.check.formula(path, entry) or ZERO for entry in entries)
+    x, y, *third = (check.formula(path, entry) or ZERO for entry in entries)
     return x, y, third[0] if third else ZERO
 
 
 def _attachment(
-    values: ValueChecker, path: Path, entry: SpringTable | DamperTable
+    check: ValueChecker, path: Path, entry: SpringTable | DamperTable
 ) -> dict[str, Any]:
     """Return where a spring or damper acts, as arguments of `assembly.SpringDamper`."""
-    check, kind = values.check, path[0]
+    kind = path[0]
     if (entry.coordinate is None) == (entry.bodies is None):
         if not {(*path, "coordinate"), (*path, "bodies")} & check.repaired:
             check.report(
@@ -610,19 +578,12 @@ def _attachment(
         for key in ("points", "turning"):
             if getattr(entry, key):
                 check.report((*path, key), f"belongs to a {kind} between 'bodies': remove it")
-        if entry.coordinate not in values.doc.coordinates:
-            remedy = suggest(entry.coordinate, values.doc.coordinates)
-            remedy = remedy or f": known are {', '.join([*values.doc.coordinates][:9])}"
-            check.report(
-                (*path, "coordinate"),
-                f"'{entry.coordinate}' is not a coordinate{remedy}",
-                text=entry.coordinate,
-            )
+        check.is_coordinate((*path, "coordinate"), entry.coordinate)
         return {"coordinate": entry.coordinate}
     assert entry.bodies is not None
-    first, second = values.two_bodies((*path, "bodies"), entry.bodies, f"a {kind} acts")
+    first, second = check.two_bodies((*path, "bodies"), entry.bodies, f"a {kind} acts")
     if entry.turning:
-        if values.dimension == 3:
+        if check.dimension == 3:
             check.report(
                 (*path, "turning"),
                 f"a {kind} turns in plane scenes only: in space let it act along the "
@@ -632,36 +593,37 @@ def _attachment(
             check.report((*path, "points"), f"a turning {kind} has no points: remove them")
         return {"bodies": (first, second), "turning": True}
     points = entry.points or (None, None)
-    one, other = (values.vector((*path, "points"), point) for point in points)
+    one, other = (check.vector((*path, "points"), point) for point in points)
     return {"bodies": (first, second), "points": (one, other)}
 
 
 # --- loops ----------------------------------------------------------------------------------------
 
-_AXES_IN_WORDS = {
-    1: "one axis, or one in each body's frame",
-    2: "two axes, one in each body's frame",
-}
+_TWO_AXES = {2: "two axes, one in each body's frame"}
+_ONE_AXIS = {1: "one axis", **_TWO_AXES}
 
 
 class LoopChecker:
     """Checks the [[loop]] tables of a scene, also that their constraint equations differ in name.
 
-    Errors are reported to the `check` of `values`.
+    Errors are reported to `check`.
     """
 
-    def __init__(self, values: ValueChecker) -> None:
-        self.values = values
-        self.check, self.doc = values.check, values.doc
-        self.rows = {*values.doc.constraints}  # names of constraint equations so far
+    def __init__(self, check: ValueChecker) -> None:
+        self.check, self.doc = check, check.doc
+        rows = dict.fromkeys(check.doc.constraints, "is a row of another constraint")
+        self.rows = names_taken_from_rows(check) | rows  # names in use
+        self.loops: dict[str, str] = {}
 
     def loop(self, path: Path, entry: LoopTable) -> LoopJoint | None:
         """Check a [[loop]] table and return the loop, or None if its kind of joint is unknown.
 
         path: keys of the table in the scene. entry: the table. Errors are reported.
         """
-        kind = self._kind(path, entry)
-        if not kind or self.values.dimension is None:
+        if (*path, "joint") in self.check.repaired:
+            return None
+        kind = self.check.kind(path, entry.joint, CLOSINGS, "closes loops")
+        if not kind or self.check.dimension is None:
             return None
         if kind == "gear":
             parts = self._gear(path, entry)
@@ -671,8 +633,8 @@ class LoopChecker:
                 "bodies": bodies,
                 "points": self._ends(path, entry),
                 "axes": self._axes_of_loop((*path, "axis"), kind, entry),
-                "rotation": self.values.rotation(
-                    (*path, "rotation"), entry.rotation, self.values.formula
+                "rotation": self.check.rotation(
+                    (*path, "rotation"), entry.rotation, self.check.parameter_formula
                 ),
                 "length": self._distance((*path, "length"), kind, entry),
             }
@@ -681,55 +643,27 @@ class LoopChecker:
         self._check_row_names(path, loop)
         return loop
 
-    def _kind(self, path: Path, entry: LoopTable) -> str:
-        """Return the kind of joint; "" if there is no such kind, which is reported."""
-        if (*path, "joint") in self.check.repaired:
-            return ""
-        known = [k for k, kind in CLOSINGS.items() if kind.plane or self.values.dimension != 2]
-        joint = entry.joint
-        if joint in known:
-            return joint
-        if joint in CLOSINGS:
-            instead = "revolute" if joint == "spherical" else "one of " + ", ".join(known)
-            why = (
-                f"a {joint} joint closes loops in space, and gravity has two entries, so the scene "
-                f"is plane: give gravity a third, or use {instead}"
-            )
-        else:
-            near = CLOSING_ALIASES.get(joint.lower(), "") or nearest(joint, CLOSINGS)
-            near = near if near in known else ""
-            remedy = f"; did you mean '{near}'?" if near else f": known are {', '.join(known)}"
-            why = f"there is no joint '{joint}' that closes a loop{remedy}"
-        self.check.report((*path, "joint"), why, text=joint)
-        return ""
-
     def _bodies_of_loop(self, path: Path, entry: LoopTable) -> tuple[str, ...]:
         """Return the two bodies."""
         check = self.check
         if entry.bodies is None:
-            if (*path, "bodies") not in check.repaired:
-                what = 'missing: name the two that it joins, bodies = ["coupler", "rocker"]'
-                check.report((*path, "bodies"), what)
+            what = 'name the two that it joins, bodies = ["coupler", "rocker"]'
+            check.report_missing((*path, "bodies"), what)
             return (WORLD, WORLD)
-        return self.values.two_bodies((*path, "bodies"), entry.bodies, "a loop closes")
+        return self.check.two_bodies((*path, "bodies"), entry.bodies, "a loop closes")
 
     def _ends(self, path: Path, entry: LoopTable) -> tuple[Vector, ...]:
         """Return the position of the joint in the frame of each body; the origin of a [[point]]."""
         if entry.points is not None:
-            one, other = (self.values.vector((*path, "points"), point) for point in entry.points)
+            one, other = (self.check.vector((*path, "points"), point) for point in entry.points)
             return one, other
         declared = {point.name for point in self.doc.point.values()}
-        if (
-            entry.bodies
-            and not declared.issuperset(entry.bodies)
-            and (*path, "points") not in self.check.repaired
-        ):
-            example = (
-                '[[0, 0], ["l", 0]]' if self.values.dimension == 2 else '[[0, 0, 0], ["l", 0, 0]]'
-            )
-            self.check.report(
+        if entry.bodies and not declared.issuperset(entry.bodies):
+            zero = ", 0" * (self.check.dimension == 3)
+            example = f'[[0, 0{zero}], ["l", 0{zero}]]'
+            self.check.report_missing(
                 (*path, "points"),
-                f"missing: add points = {example}, where the joint is in the frame of each body",
+                f"add points = {example}, where the joint is in the frame of each body",
             )
         return ORIGIN, ORIGIN
 
@@ -737,46 +671,25 @@ class LoopChecker:
         self, path: Path, kind: str, entry: LoopTable
     ) -> tuple[tuple[float, float, float], ...]:
         """Return the axis in the frame of each body."""
-        check, joint, written = self.check, CLOSINGS[kind], entry.axis
-        across = "u" in joint.rows(self.values.dimension == 2)
-        axis_count = joint.axes if self.values.dimension == 3 or across else 0
-        if path in check.repaired:
-            return ()
-        if written is None:
-            if axis_count and not joint.defaults:
-                example = "[1, 0]" if self.values.dimension == 2 else "[1, 0, 0]"
-                why = f"missing: a {kind} joint slides along one, of the first body"
-                check.report(path, f"{why}: axis = {example}")
-            return joint.defaults if axis_count else ()
-        if not axis_count:
-            plane = joint.axes and self.values.dimension == 2
-            why = (
-                "in a plane scene joints turn about z"
-                if plane
-                else f"a {kind} joint has no axis to choose"
-            )
-            check.report(path, f"{why}: remove it")
-            return ()
-        axes = [unit for axis in written if (unit := self.values.unit(path, axis))]
-        if len(axes) < len(written):
-            return ()
-        single = not joint.defaults  # one axis, in the first body's frame
-        if len(axes) > 2 or len(axes) < joint.axes or (single and len(axes) > 1):
-            what = "one axis, of the first body" if single else _AXES_IN_WORDS[joint.axes]
-            check.report(path, f"a {kind} joint has {what}, here {len(axes)}")
-            return ()
-        return (axes[0], axes[-1])
+        joint = CLOSINGS[kind]
+        counts: dict[int, str] = {}
+        if self.check.dimension == 3 or "u" in joint.rows(plane=True):
+            counts = {0: {}, 1: _ONE_AXIS, 2: _TWO_AXES}[joint.axes]
+            if not joint.defaults and joint.axes:
+                counts = {1: "one axis, of the first body"}
+        axes = self.check.axes(path, kind, entry.axis, counts, joint.defaults if counts else ())
+        return (axes[0], axes[-1]) if axes else ()
 
     def _distance(self, path: Path, kind: str, entry: LoopTable) -> Any:
         """Return the length of a joint of kind "distance", else None."""
         if kind != "distance" or path in self.check.repaired:
             return None
         if entry.length is None:
-            self.check.report(path, 'missing: add length = "l", between the two points, m')
+            self.check.report_missing(path, 'add length = "l", between the two points, m')
             return None
-        length, value = self.values.value(path, entry.length)
+        length, value = self.check.value(path, entry.length)
         if value <= 0:
-            meet = "revolute" if self.values.dimension == 2 else "spherical"
+            meet = "revolute" if self.check.dimension == 2 else "spherical"
             why = f"is {value:g}, and must be greater than zero: points that meet are '{meet}'"
             self.check.report(path, why, text=length.text)
         return length
@@ -784,34 +697,32 @@ class LoopChecker:
     def _gear(self, path: Path, entry: LoopTable) -> dict[str, Any]:
         """Return the coordinates, ratio and offset of a gear."""
         check, coordinates = self.check, entry.coordinates or ()
-        if not coordinates and (*path, "coordinates") not in check.repaired:
-            what = 'missing: name the two that it couples, coordinates = ["phi", "psi"]'
-            check.report((*path, "coordinates"), what)
+        if not coordinates:
+            what = 'name the two that it couples, coordinates = ["phi", "psi"]'
+            check.report_missing((*path, "coordinates"), what)
         for name in coordinates:
-            if name not in self.doc.coordinates:
-                remedy = suggest(name, self.doc.coordinates)
-                remedy = remedy or f": known are {', '.join([*self.doc.coordinates][:9])}"
-                why = f"'{name}' is not a coordinate{remedy}"
-                check.report((*path, "coordinates"), why, text=name)
+            self.check.is_coordinate((*path, "coordinates"), name)
             check.used[name].append((*path, "coordinates"))
         if coordinates and coordinates[0] == coordinates[1]:
             why = f"a gear couples two coordinates, here both are '{coordinates[0]}'"
             check.report((*path, "coordinates"), why)
         ratio = ZERO
         if entry.ratio is not None:
-            ratio, value = self.values.value((*path, "ratio"), entry.ratio)
+            ratio, value = self.check.value((*path, "ratio"), entry.ratio)
             if value == 0:
                 why = "is 0, so that the second coordinate does not move: give it no coordinate"
                 check.report((*path, "ratio"), why, text=ratio.text)
-        elif (*path, "ratio") not in check.repaired:
-            why = 'missing: add ratio = "n", of the second coordinate over the first'
-            check.report((*path, "ratio"), why)
-        offset = self.values.formula((*path, "offset"), entry.offset) if entry.offset else ZERO
+        else:
+            why = 'add ratio = "n", of the second coordinate over the first'
+            check.report_missing((*path, "ratio"), why)
+        offset = (
+            self.check.parameter_formula((*path, "offset"), entry.offset) if entry.offset else ZERO
+        )
         return {"coordinates": coordinates, "ratio": ratio, "offset": offset}
 
     def _report_foreign_keys(self, path: Path, kind: str, entry: LoopTable) -> None:
         """Report keys that belong to other kinds of joints."""
-        turned = any(row in ("rz",) for row in CLOSINGS[kind].rows(self.values.dimension == 2))
+        turned = any(row in ("rz",) for row in CLOSINGS[kind].rows(self.check.dimension == 2))
         of_bodies = kind != "gear"
         belongs = {
             "bodies": of_bodies, "points": of_bodies, "axis": of_bodies, "rotation": turned,
@@ -827,20 +738,13 @@ class LoopChecker:
 
     def _check_row_names(self, path: Path, loop: LoopJoint) -> None:
         """Report a name of the loop or of its constraint equations that is in use already."""
-        check, path = self.check, (*path, "name")
-        if path in check.repaired:
+        path = (*path, "name")
+        if path in self.check.repaired:
             return
-        others = [e.name for e in self.doc.loop.values()]
-        if why := names.fault(loop.name):
-            check.report(path, why, text=loop.name)
-        elif others.count(loop.name) > 1:
-            why = f"'{loop.name}' is a loop already: rename one of the two"
-            check.report(path, why, text=loop.name)
-        else:
-            for name in loop.rows(self.values.dimension == 2).values():
-                why = row_name_fault(check, self.doc, name)
-                if not why and name in self.rows:
-                    why = f"'{name}' is a row of another constraint"
+        if self.check.claim(path, loop.name, self.loops, "is a loop already"):
+            for name in loop.rows(self.check.dimension == 2).values():
+                why = names.fault(name) or (name in self.rows and f"'{name}' {self.rows[name]}")
                 if why:
-                    check.report(path, f"a row of the loop: {why}: rename the loop", text=loop.name)
-                self.rows.add(name)
+                    why = f"a row of the loop: {why}: rename the loop"
+                    self.check.report(path, why, text=loop.name)
+                self.rows[name] = "is a row of another constraint"

@@ -1,75 +1,372 @@
-"""Checks of the tables [coordinates], [constraints], [[event]] and [picture] of a scene.
+"""Checks of the values of a scene, and of its tables except those of bodies.
 
-Each function checks the entries of one table and yields them as checked data. Independent of SymPy.
+`ValueChecker` checks formulas, vectors, rotations and inertias. Each function below checks the
+entries of [coordinates], [constraints], [[event]] or [picture]. Independent of SymPy.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-from eomc.base import names, texts
-from eomc.scene import formulas, messages
-from eomc.scene.assembly import WORLD, Assembly, Turn, Vector
-from eomc.scene.formulas import Formula, FormulaError, suggest
+from mpmath import mp
+
+from eomc.base import spatial, texts
+from eomc.scene import formulas, hints, schema
+from eomc.scene.formulas import Formula, FormulaError, Value, nearest, suggest
+from eomc.scene.joints import Axis, Closing, Joint
 from eomc.scene.scene import (
+    WORLD,
+    Assembly,
+    NamedFormula,
     Picture,
     PicturePlace,
-    SceneConstraint,
     SceneCoordinate,
     SceneEvent,
     Shape,
+    Turn,
+    Vector,
 )
 from eomc.scene.schema import BodyTable, Document, EventTable
 from eomc.scene.schema import Place as Written
 from eomc.scene.scope import INPUT, VELOCITY, Checker, Path
-from eomc.scene.validate_values import ORIGIN, ZERO
+from eomc.scene.toml_text import SourceMap
+
+WORLD_TAKEN = {WORLD: "is the frame that does not move"}
+MOMENT_TOLERANCE = 1e-6  # relative: files give moments of inertia to six digits and more
+
+ZERO = formulas.parse("0")
+ORIGIN: Vector = (ZERO, ZERO, ZERO)
+
+
+class ValueChecker(Checker):
+    """Checker of a scene that also checks vectors, rotations, masses and inertias.
+
+    doc: the whole scene. known: values of constants and parameters by name, so far. body_paths: the
+    place of each body and point by its name. dimension: number of components of a vector, 2 or 3;
+    None if it is unknown.
+    """
+
+    def __init__(self, places: SourceMap) -> None:
+        super().__init__(places)
+        self.doc: Document = Document()
+        self.known: dict[str, float] = {}
+        self.body_paths: dict[str, Path] = {}
+        self.dimension: int | None = 2
+        self.checked: dict[Value, tuple[Formula, float]] = {}  # valid formulas by their text
+        self.has_inertia: dict[str, bool] = {}
+
+    def value(self, path: Path, value: Value, nonnegative: bool = False) -> tuple[Formula, float]:
+        """Check an entry that may use constants and parameters; return its formula and its value.
+
+        value: the entry, a number or the text of a formula. nonnegative: True if it must not be
+        negative. The returned value is that for the scene's parameters. After an error, report it
+        and return (formula of 0, nan).
+        """
+        if value not in self.checked:
+            rule = f"'{path[-1]}' is made of numbers, constants and parameters"
+            formula = self.formula(path, value, self.known, rule)
+            number = self.number(path, formula, self.known)
+            if formula is None or math.isnan(number):
+                return ZERO, math.nan
+            self.checked[value] = formula, number
+        formula, number = self.checked[value]
+        if nonnegative and number < 0:
+            self.report(path, f"is {number:g}, and can't be negative", text=formula.text)
+        return formula, number
+
+    def parameter_formula(self, path: Path, value: Value) -> Formula:
+        """Check an entry that may use constants and parameters, and return its formula.
+
+        value: a number or the text of a formula. After an error, report it and return the formula
+        of 0.
+        """
+        return self.value(path, value)[0]
+
+    def position_formula(self, path: Path, value: Value) -> Formula:
+        """Check a formula of a position or angle, and return it.
+
+        It must not depend on inputs or velocities, and not contain dot(...). value: a number or the
+        text of the formula. Errors are reported; if the formula can't be parsed, return 0.
+        """
+        formula = self.formula(path, value)
+        if formula is None:
+            return ZERO
+        no_inputs = (
+            f"'{path[-1]}' can't depend on inputs, whose rates nobody knows: "
+            "let them act through an actuator or [forces]"
+        )
+        no_velocities = (
+            f"'{path[-1]}' can't depend on velocities: it is made of coordinates, "
+            "t, parameters, constants and definitions of these"
+        )
+        if not self.depends_on(path, formula, INPUT, no_inputs):
+            if not self.depends_on(path, formula, VELOCITY, no_velocities):
+                if any(formula.calls("dot")):
+                    self.report(path, no_velocities, text=formula.text)
+        self.check_smooth(path, formula)
+        return formula
+
+    def vector(
+        self,
+        path: Path,
+        entries: Sequence[Value] | None,
+        formula: Callable[[Path, Value], Formula] | None = None,
+    ) -> Vector:
+        """Check a vector and return its three components; in a plane scene, the third is 0.
+
+        entries: two or three numbers or formulas; None for a vector of zeros. formula: the method
+        that checks each entry, by default `parameter_formula`. Errors are reported.
+        """
+        if entries is None or not self.fits(path, len(entries)):
+            return ORIGIN
+        checked = [(formula or self.parameter_formula)(path, entry) for entry in entries]
+        x, y, z = (*checked, ZERO, ZERO, ZERO)[:3]
+        return x, y, z
+
+    def fits(self, path: Path, entries: int) -> bool:
+        """Return True if a vector with this number of entries fits the dimension of the scene.
+
+        Vectors have two entries in a plane scene and three in space. Otherwise, report the error.
+        """
+        if entries == self.dimension:
+            return True
+        as_others = "as gravity has" if self.doc.gravity else "as the others here"
+        words = {
+            2: f"two entries in a plane scene, {as_others}",
+            3: f"three entries in space, {as_others}",
+            None: "two entries in the plane and three in space",
+        }
+        if self.dimension or not self.doc.body:
+            self.report(path, f"vectors have {words[self.dimension]}, here {entries}")
+        return False
+
+    def unit(self, path: Path, axis: Sequence[float]) -> tuple[float, float, float] | None:
+        """Return an axis as a unit vector of three components.
+
+        axis: two numbers in a plane scene, three in space. After an error, report it and return
+        None.
+        """
+        if not self.fits(path, len(axis)):
+            return None
+        size = math.hypot(*axis)
+        if size < 1e-9:
+            self.report(path, "the axis has no length, so no direction: give it one")
+            return None
+        x, y, *third = (entry / size for entry in axis)
+        return x, y, third[0] if third else 0.0
+
+    def kind(
+        self, path: Path, joint: str, kinds: Mapping[str, Joint] | Mapping[str, Closing], what: str
+    ) -> str:
+        """Return a kind of joint if the scene can have it; else report why not, and return "".
+
+        path: keys of the table in the scene. joint: the kind that it names. kinds: all kinds. what:
+        what such a joint does, for a message.
+        """
+        known = [k for k, kind in kinds.items() if kind.plane or self.dimension != 2]
+        if joint in known:
+            return joint
+        if joint in kinds:
+            why = (
+                f"a {joint} joint {what} in space, and gravity has two entries, so the scene is "
+                f"plane: give gravity a third, or use {', '.join(known)}"
+            )
+        else:
+            aliases = {other: k for k, kind in kinds.items() for other in kind.aliases}
+            near = aliases.get(joint.lower(), "") or nearest(joint, kinds)
+            remedy = (
+                f"; did you mean '{near}'?" if near in known else f": known are {', '.join(known)}"
+            )
+            why = f"there is no joint '{joint}' that {what}{remedy}"
+        self.report((*path, "joint"), why, text=joint)
+        return ""
+
+    def axes(
+        self,
+        path: Path,
+        kind: str,
+        written: Sequence[Sequence[float]] | None,
+        counts: Mapping[int, str],
+        defaults: tuple[Axis, ...],
+    ) -> tuple[Axis, ...]:
+        """Check the axes of a joint and return them as unit vectors. Errors are reported.
+
+        kind: kind of the joint. written: its axes in the scene; None for the defaults. counts: the
+        numbers of axes that it can have, each in words; empty if it has none. defaults: its axes
+        if none are given; empty if they must be.
+        """
+        if path in self.repaired or self.dimension is None:
+            return ()
+        if written is None and (defaults or not counts):
+            return defaults
+        if written is None:
+            example = "[1, 0]" if self.dimension == 2 else "[1, 0, 0]"
+            fault = f"missing: a {kind} joint slides along {counts[1]}: axis = {example}"
+        elif not counts and kind == "revolute":
+            fault = "in a plane scene joints turn about z: remove it"
+        elif not counts:
+            fault = f"a {kind} joint has no axis to choose: remove it"
+        elif len(written) not in counts:
+            fault = f"a {kind} joint has {' or '.join(counts.values())}, here {len(written)}"
+        else:
+            axes = [unit for axis in written if (unit := self.unit(path, axis))]
+            return tuple(axes) if len(axes) == len(written) else ()
+        self.report(path, fault)
+        return ()
+
+    def is_coordinate(self, path: Path, name: str) -> bool:
+        """Return True if `name` is a coordinate; else report that it is not."""
+        coordinates = self.doc.coordinates
+        if name in coordinates:
+            return True
+        remedy = suggest(name, coordinates) or f": known are {', '.join([*coordinates][:9])}"
+        if table := self.tables.get(name):
+            remedy = f": it stands in [{table}]"
+        self.report(path, f"'{name}' is not a coordinate{remedy}", text=name)
+        return False
+
+    def is_body(self, path: Path, name: str) -> bool:
+        """Return True if `name` is a body, a point or the world; else report that it is not."""
+        if name == WORLD or name in self.body_paths:
+            return True
+        remedy = suggest(name, [WORLD, *self.body_paths]) or ": declare it as a [[body]]"
+        self.report(path, f"there is no body '{name}'{remedy}", text=name)
+        return False
+
+    def two_bodies(self, path: Path, bodies: tuple[str, ...], kind: str) -> tuple[str, str]:
+        """Check that the two bodies named by an entry exist and differ, and return their names.
+
+        One of them may be "world". kind: the beginning of a message, such as "a spring acts".
+        Errors are reported.
+        """
+        first, second = bodies
+        for name in bodies:
+            self.is_body(path, name)
+        if first == second:
+            self.report(path, f"{kind} between two bodies, here both are '{first}'")
+        return first, second
+
+    def rotation(
+        self,
+        path: Path,
+        rotation: Any,
+        formula: Callable[[Path, Value], Formula] | None = None,
+    ) -> tuple[Turn, ...]:
+        """Check a rotation and return its successive turns, each about an axis.
+
+        rotation: an angle about z in a plane scene, or a tuple of pairs (axis, angle), or None for
+        no rotation. formula: the method that checks an angle, by default `parameter_formula`.
+        Errors are reported.
+        """
+        formula = formula or self.parameter_formula
+        if rotation is None:
+            return ()
+        if not isinstance(rotation, tuple):
+            if self.dimension == 3:
+                self.report(
+                    path, 'in space a rotation names its axis: write [["z", "pi/2"]], or more turns'
+                )
+            return (Turn("z", formula(path, rotation)),)
+        for axis, _ in rotation:
+            if axis != "z" and self.dimension == 2:
+                self.report(path, f"a plane scene turns about z only, here about {axis}")
+                break
+        return tuple(Turn(axis, formula(path, angle)) for axis, angle in rotation)
+
+    def mass(self, path: Path, entry: BodyTable) -> tuple[Formula, Any]:
+        """Check the mass and the inertia of a body, and return their formulas.
+
+        path: keys of the body in the scene. The inertia has the six components Ixx, Iyy, Izz, Ixy,
+        Ixz, Iyz in kg m^2; those that are not given are 0. Errors are reported.
+        """
+        mass, value = self.value((*path, "mass"), entry.mass, nonnegative=True)
+        inertia, moments = self._inertia((*path, "inertia"), entry.inertia)
+        self.has_inertia[entry.name] = value != 0 or any(m != 0 for m in moments)
+        return mass, inertia
+
+    def _inertia(self, path: Path, inertia: Any) -> tuple[tuple[Formula, ...], list[float]]:
+        nothing = (ZERO,) * 6
+        if inertia is None or self.dimension is None:
+            return nothing, [math.nan] if self.dimension is None else [0.0]
+        single = not isinstance(inertia, tuple)
+        entries = (inertia,) if single else inertia
+        if self.dimension == 2 and not single:
+            self.report(path, "a plane scene has one number for it, about z: write it alone")
+            return nothing, [math.nan]
+        if self.dimension == 3 and (single or len(entries) not in (3, 6)):
+            here = "one number" if single else str(len(entries))
+            self.report(
+                path,
+                "in space it has three entries, [Ixx, Iyy, Izz], or six, "
+                f"[Ixx, Iyy, Izz, Ixy, Ixz, Iyz], here {here}",
+            )
+            return nothing, [math.nan]
+        checked = [self.value(path, entry, nonnegative=self.dimension == 2) for entry in entries]
+        moments, numbers = [f for f, _ in checked], [v for _, v in checked]
+        if self.dimension == 2:
+            return (ZERO, ZERO, moments[0], ZERO, ZERO, ZERO), numbers
+        self._moments(path, [*numbers, 0.0, 0.0, 0.0][:6])
+        return (*moments, ZERO, ZERO, ZERO)[:6], numbers
+
+    def _moments(self, path: Path, inertia: Sequence[float]) -> None:
+        """Report principal moments that no body can have.
+
+        They are impossible if one is negative, or larger than the sum of the two others.
+        """
+        if not all(abs(x) < 1e150 for x in inertia):
+            return
+        tensor = mp.matrix(spatial.tensor(inertia))  # NumPy takes 0.1 s to load
+        small, middle, large = sorted(map(float, mp.eigsy(tensor, eigvals_only=True)))
+        tolerance = MOMENT_TOLERANCE * max(abs(small), abs(large))
+        shown = f"{small:.4g}, {middle:.4g} and {large:.4g} kg m^2"
+        if small < -tolerance:
+            self.report(
+                path,
+                f"its principal moments are {shown}, and none can be negative: "
+                "check signs and order, [Ixx, Iyy, Izz, Ixy, Ixz, Iyz]",
+            )
+        elif large > small + middle + tolerance:
+            self.report(
+                path,
+                f"its principal moments are {shown}, and one is larger than the two others "
+                "together, which no body has: check it, about the centre of mass",
+            )
+
+
+# --- coordinates ----------------------------------------------------------------------------------
 
 SUSPICIOUS_ANGLE = 7.0  # rad, more than one turn
 FRICTION_WIDTH = formulas.parse("0.01")  # rad/s or m/s
 
 
-def check_coordinates(
-    check: Checker, doc: Document, known: Mapping[str, float]
-) -> Iterator[SceneCoordinate]:
+def check_coordinates(check: ValueChecker) -> Iterator[SceneCoordinate]:
     """Check the table [coordinates] of a document and yield its coordinates.
 
-    known: values of constants and parameters by name. Errors are reported to `check`; faulty
-    entries may be left out.
+    Errors are reported to `check`.
     """
-
-    def formula(name: str, key: str, value: float | str) -> tuple[Formula | None, float]:
-        path = ("coordinates", name, key)
-        rule = f"a {key} is made of numbers, constants and parameters"
-        checked = check.formula(path, value, known, rule)
-        return checked, check.number(path, checked, known)
-
-    free = not (doc.constraints or doc.loop)
-    for name, entry in doc.coordinates.items():
-        start, rate = (formula(name, key, getattr(entry, key))[0] for key in ("start", "rate"))
+    free = not (check.doc.constraints or check.doc.loop)
+    for name, entry in check.doc.coordinates.items():
+        path = ("coordinates", name)
+        start = check.parameter_formula((*path, "start"), entry.start)
+        rate = check.parameter_formula((*path, "rate"), entry.rate)
         if entry.unit == "rad" and isinstance(entry.start, (int, float)):
-            check_turns(check, ("coordinates", name, "start"), entry.start)
-        fixed_keys = () if entry.guess else entry.model_fields_set
+            check_turns(check, (*path, "start"), entry.start)
+        fixed_keys = () if entry.guess else entry.written
         is_fixed, is_rate_fixed = (free or key in fixed_keys for key in ("start", "rate"))
         friction, width = None, FRICTION_WIDTH
         if entry.friction is not None:
-            friction, value = formula(name, "friction", entry.friction)
-            if friction and value < 0:
-                path = ("coordinates", name, "friction")
-                check.report(path, f"is {value:g}, and can't be negative", text=friction.text)
+            friction, _ = check.value((*path, "friction"), entry.friction, nonnegative=True)
         if entry.friction_width is not None:
-            checked, value = formula(name, "friction_width", entry.friction_width)
-            width = checked or FRICTION_WIDTH
-            check_width(check, ("coordinates", name), value, checked, entry.friction)
-        if start and rate:
-            yield SceneCoordinate(
-                name, entry.unit, start, rate, entry.note, is_fixed, is_rate_fixed, friction, width
-            )
+            width = check_width(check, path, entry.friction_width, entry.friction)
+        yield SceneCoordinate(
+            name, entry.unit, start, rate, entry.note, is_fixed, is_rate_fixed, friction, width
+        )
 
 
-def check_turns(check: Checker, path: tuple[str, ...], angle: float) -> None:
+def check_turns(check: ValueChecker, path: tuple[str, ...], angle: float) -> None:
     """Report a warning if an angle in rad is larger than one turn, since degrees may be meant.
 
     path: keys of the entry in the scene.
@@ -77,30 +374,28 @@ def check_turns(check: Checker, path: tuple[str, ...], angle: float) -> None:
     if SUSPICIOUS_ANGLE <= abs(angle) < math.inf:
         message = (
             f"{angle:.6g} rad are {abs(angle) / math.tau:.3g} turns; for degrees write "
-            f"{messages.degrees_formula(f'{angle:.15g}')}"
+            f"{hints.degrees_formula(f'{angle:.15g}')}"
         )
         check.report(path, message, severity="warning")
 
 
 def check_width(
-    check: Checker, path: tuple[str, ...], value: float, width: Formula | None, friction: object
-) -> None:
-    """Report an error if the entry `friction_width` is not positive or has no `friction` with it.
+    check: ValueChecker, path: tuple[str, ...], written: Value, friction: object
+) -> Formula:
+    """Check the entry `friction_width` of a coordinate or body, and return its formula.
 
-    The width is the velocity within which Coulomb friction is smoothed. path: keys of the
-    coordinate or body. value: value of the width in rad/s or m/s. width: formula of the width.
-    friction: the entry `friction`, None if it is missing.
+    The width is the velocity within which Coulomb friction is smoothed, in rad/s or m/s. path: keys
+    of the coordinate or body. written: the entry. friction: the entry `friction`, None if it is
+    missing. Errors are reported.
     """
     path = (*path, "friction_width")
+    width, value = check.value(path, written)
     if value <= 0:
-        check.report(
-            path,
-            f"is {value:g}, and must be greater than zero: the rate within which friction is "
-            "smoothed",
-            text=width.text if width else None,
-        )
+        why = "must be greater than zero: the rate within which friction is smoothed"
+        check.report(path, f"is {value:g}, and {why}", text=width.text)
     if friction is None:
         check.report(path, "there is no 'friction' with it: add it")
+    return width
 
 
 # --- constraints ----------------------------------------------------------------------------------
@@ -108,60 +403,48 @@ def check_width(
 _MULTIPLIER = r"lambda(_\w+)?|(\w+_)?(multiplier|reaction)s?"
 
 
-def check_constraints(check: Checker, doc: Document) -> Iterator[SceneConstraint]:
+def check_constraints(check: ValueChecker) -> Iterator[NamedFormula]:
     """Check the table [constraints] of a document and yield its constraint equations.
 
     Errors are reported to `check`; faulty entries may be left out.
     """
-    for name, entry in doc.constraints.items():
-        if why := row_name_fault(check, doc, name):
-            end = "" if names.fault(name) else ": give the constraint a name of its own"
-            check.report(("constraints", name), why + end)
+    taken = names_taken_from_rows(check)
+    for name, entry in check.doc.constraints.items():
+        check.claim(("constraints", name), name, taken, "stands in [constraints] already")
         path = ("constraints", name, "formula")
-        if isinstance(entry.formula, str) and (why := _equation_remedy(entry.formula)):
-            check.report(path, why, text=entry.formula)
+        text = str(entry.formula)
+        if (formula_text := hints.difference(text)) and not re.search("[<>]", text):
+            why = f"a constraint is what is zero: write {formula_text}"
+            check.report(path, why, text=text)
             continue
         formula = check.formula(path, entry.formula)
         if formula is None or path in check.repaired:  # reported already
             continue
-        if INPUT in check.kinds_of(formula.tree):
-            check.report(
-                path,
-                "a constraint can't depend on inputs, whose rates nobody knows: let them act "
-                "through [forces], or write the motion wanted as a function of t",
-                check.find_part(formula, INPUT),
-                formula.text,
-            )
+        why = (
+            "a constraint can't depend on inputs, whose rates nobody knows: let them act "
+            "through [forces], or write the motion wanted as a function of t"
+        )
+        check.depends_on(path, formula, INPUT, why)
         check.check_smooth(path, formula)
-        yield SceneConstraint(name, entry.unit, formula, entry.note)
+        yield NamedFormula(name, entry.unit, formula, entry.note)
 
 
-def _equation_remedy(text: str) -> str:
-    """Return what to write in place of an equation; "" if the text is not an equation."""
-    sides = [side.strip() for side in text.replace("==", "=").split("=")]
-    if len(sides) != 2 or not all(sides):
-        return ""
-    left, right = sides
-    if right == "0":
-        return f"a constraint is what is zero, without '= 0': write {left}"
-    right = right if re.fullmatch(r"[\w.*/()]+", right) else f"({right})"
-    return f"a constraint is what is zero: write {left} - {right}"
+def names_in_use(doc: Document, tables: Mapping[str, str]) -> dict[str, str]:
+    """Return a dict from names to words on what has them, such as "is the velocity of 'x'".
 
-
-def row_name_fault(check: Checker, doc: Document, name: str) -> str:
-    """Return the reason why a constraint equation can't be called `name`, or "" if it can.
-
-    A name is refused if it is not valid or if the scene uses it already.
+    tables: the table in which each name is declared.
     """
-    taken = {n: f"stands in [{table}]" for n, table in check.tables.items()}
-    taken |= dict.fromkeys(doc.outputs, "stands in [outputs]")
+    taken = {name: f"stands in [{table}] already" for name, table in tables.items()}
     taken |= {f"{c}_dot": f"is the velocity of '{c}'" for c in doc.coordinates}
-    taken |= {f"{c}_ddot": f"is the acceleration of '{c}'" for c in doc.coordinates}
-    taken |= dict.fromkeys(check.centers - {*check.tables}, "is where a body or point is")
-    taken |= {"energy": "is K + P"}
-    if why := names.fault(name):
-        return why
-    return f"'{name}' {taken[name]} already" if name in taken else ""
+    return {**taken, "t": "is the time", "energy": "is K + P"}
+
+
+def names_taken_from_rows(check: ValueChecker) -> dict[str, str]:
+    """Return the names that no constraint equation can have, as `names_in_use` does."""
+    taken = names_in_use(check.doc, check.tables)
+    taken |= dict.fromkeys(check.doc.outputs, "stands in [outputs] already")
+    taken |= {f"{c}_ddot": f"is the acceleration of '{c}'" for c in check.doc.coordinates}
+    return taken | dict.fromkeys(check.centers - {*check.tables}, "is where a body or point is")
 
 
 def force_names(doc: Document, assembly: Assembly | None) -> list[str]:
@@ -187,7 +470,7 @@ def _coordinates_of(body: BodyTable) -> tuple[str, ...]:
 
 
 def reports_unknown_multiplier(
-    check: Checker, doc: Document, path: Path, text: float | str, known: Sequence[str]
+    check: ValueChecker, path: Path, text: Value, known: Sequence[str]
 ) -> bool:
     """Check that the formula of an output calls multipliers and reactions by known names.
 
@@ -195,10 +478,10 @@ def reports_unknown_multiplier(
     and reactions. Returns True, after reporting an error, if the formula uses another name for one.
     """
     rows = {name.removeprefix("lambda_") for name in known}
-    rows |= {entry.name for entry in doc.loop.values()}
-    if not rows or not isinstance(text, str):
+    rows |= {entry.name for entry in check.doc.loop.values()}
+    if not rows:
         return False
-    for word in re.finditer(r"(?<![\w.])[A-Za-z_]\w*", text):
+    for word in re.finditer(r"(?<![\w.])[A-Za-z_]\w*", text := str(text)):
         named = word[0] in rows or re.fullmatch(_MULTIPLIER, word[0])
         if named and word[0] not in check.kinds:
             matching = [name for name in known if word[0] in rows and word[0] in name]
@@ -211,13 +494,13 @@ def reports_unknown_multiplier(
     return False
 
 
-def check_guesses(check: Checker, doc: Document) -> None:
+def check_guesses(check: ValueChecker) -> None:
     """Report a warning for each key `guess` in a scene without constraint equations.
 
     There it has no effect: it marks initial values that may be changed to satisfy constraints.
     """
-    if not (doc.constraints or doc.loop):
-        for name, entry in doc.coordinates.items():
+    if not (check.doc.constraints or check.doc.loop):
+        for name, entry in check.doc.coordinates.items():
             if entry.guess:
                 check.report(
                     ("coordinates", name, "guess"),
@@ -229,35 +512,24 @@ def check_guesses(check: Checker, doc: Document) -> None:
 
 # --- events ---------------------------------------------------------------------------------------
 
-COMPARISON = re.compile(r"\s*([^<>=!]+?)\s*(?:[<>]=?|==)\s*([^<>=!]+?)\s*")
-INPUT_REMEDY = ": write '{name}*on' where it acts, with a parameter on = 1, and set that to 0"
-CONSTANT_REMEDY = ", and does not change in a run: make it a parameter"
 
-
-def check_events(check: Checker, doc: Document) -> Iterator[SceneEvent]:
+def check_events(check: ValueChecker) -> Iterator[SceneEvent]:
     """Check the [[event]] tables of a document and yield the events.
 
     Errors are reported to `check`; faulty entries may be left out.
     """
-    names_so_far: set[str] = set()
-    for k, entry in doc.event.items():
-        if why := names.fault(entry.name):
-            check.report(("event", k, "name"), why, text=entry.name)
-        elif entry.name in names_so_far:
-            why = f"'{entry.name}' is an event already: rename one of the two"
-            check.report(("event", k, "name"), why, text=entry.name)
-        names_so_far.add(entry.name)
+    taken: dict[str, str] = {}
+    for k, entry in check.doc.event.items():
+        check.claim(("event", k, "name"), entry.name, taken, "is an event already")
         path = ("event", k, "when")
         if path in check.repaired:  # reported already
             continue
-        if isinstance(entry.when, str) and (match := COMPARISON.fullmatch(entry.when)):
-            less = match[2] if re.fullmatch(r"[\w.]+", match[2]) else f"({match[2]})"
-            check.report(
-                path, f'it happens where a formula crosses zero: write "{match[1]} - {less}"'
-            )
+        if formula_text := hints.difference(str(entry.when)):
+            why = f'it happens where a formula crosses zero: write "{formula_text}"'
+            check.report(path, why)
             continue
         when = check.formula(path, entry.when)
-        jump = tuple(_jump(check, doc, k, entry))
+        jump = tuple(_jump(check, k, entry))
         if when and not any(when.names()):
             check.report(
                 ("event", k, "when"), "never crosses zero: it has no names", text=when.text
@@ -266,30 +538,25 @@ def check_events(check: Checker, doc: Document) -> Iterator[SceneEvent]:
             yield SceneEvent(entry.name, when, entry.direction, entry.action, jump, entry.note)
 
 
-def _jump(
-    check: Checker, doc: Document, k: str, entry: EventTable
-) -> Iterator[tuple[str, Formula]]:
+def _jump(check: ValueChecker, k: str, entry: EventTable) -> Iterator[tuple[str, Formula]]:
     """Yield (name, formula) for each coordinate, velocity or parameter that a jump sets."""
-    state = [name for c in doc.coordinates for name in (c, f"{c}_dot")]
-    state += doc.parameters
-    assignments = entry.model_extra or {}
-    for name, value in assignments.items():
+    state = [name for c in check.doc.coordinates for name in (c, f"{c}_dot")]
+    state += check.doc.parameters
+    for name, value in entry.jump.items():
         path = ("event", k, name)
         if name not in state:
-            remedy = suggest(name, [*state, *EventTable.model_fields])
-            if name in doc.inputs:
-                remedy = INPUT_REMEDY.format(name=name)
-            elif name in doc.constants:
-                remedy = CONSTANT_REMEDY
+            remedy = suggest(name, [*state, *schema.keys(EventTable)])
+            if name in check.doc.inputs:
+                remedy = hints.SWITCH_OFF.format(name=name)
+            elif name in check.doc.constants:
+                remedy = hints.MAKE_PARAMETER
             remedy = remedy or f": a jump sets {texts.listed(state, 9)}"
             check.report(path, f"'{name}' is no coordinate, velocity or parameter{remedy}")
-        elif isinstance(value, bool) or not isinstance(value, (int, float, str)):
-            check.report(path, "must be a number or a formula in quotes")
-        elif formula := check.formula(path, float(value) if isinstance(value, int) else value):
+        elif formula := check.formula(path, value):
             yield name, formula
-    if entry.action == "jump" and not assignments:
+    if entry.action == "jump" and not entry.jump:
         check.report(("event", k, "action"), f'a jump sets something: add {state[1]} = "..."')
-    first = next((name for name in assignments if name in state), "")
+    first = next((name for name in entry.jump if name in state), "")
     if first and entry.action != "jump":
         check.report(("event", k, first), f"only a jump sets '{first}': add action = \"jump\"")
 
@@ -299,28 +566,27 @@ def _jump(
 _SIMPLE = (("dots", "dot"), ("lines", "line"), ("springs", "spring"), ("paths", "path"))
 
 
-def check_picture(check: Checker, doc: Document, known: Mapping[str, float]) -> Picture | None:
+def check_picture(check: ValueChecker) -> Picture | None:
     """Check the table [picture] of a scene and return the picture, or None if there is no table.
 
-    known: values of constants and parameters by name. Errors are reported to `check`.
+    Errors are reported to `check`.
     """
-    return _Picture(check, doc, known).checked() if doc.picture else None
+    return _Picture(check).checked() if check.doc.picture else None
 
 
 class _Picture:
-    def __init__(self, check: Checker, doc: Document, known: Mapping[str, float]) -> None:
+    def __init__(self, check: ValueChecker) -> None:
+        doc = check.doc
         assert doc.picture is not None
-        self.check, self.known, self.table = check, known, doc.picture
+        self.check, self.table = check, doc.picture
         self.bodies = [e.name for table in (doc.body, doc.point) for e in table.values()]
-        dimension = len(doc.gravity) if doc.body and doc.gravity else 0
-        self.dimension = (
-            dimension if dimension in (2, 3) else 0
-        )  # 0: not known before the first vector
+        # None: not known before the first vector
+        check.dimension = len(doc.gravity) if doc.body and doc.gravity else None
         self.points: dict[str, Vector] = {}
 
     def checked(self) -> Picture:
         """Check the table [picture] and return the picture; errors are reported to `check`."""
-        for name, at in self.table.points.items():
+        for name, at in (self.table.points or {}).items():
             self._declare(name, at)
         shapes = [*self._simple(), *self._solids()]
         if not shapes and not self.check.faults:
@@ -329,18 +595,15 @@ class _Picture:
                 "draws nothing: add dots, lines, springs, boxes, circles or paths, "
                 'such as lines = [["cart", "tip"]]',
             )
-        axes = "xyz" if self.dimension == 3 else self.table.axes or "xy"
-        if self.table.axes and self.dimension == 3:
+        axes = "xyz" if self.check.dimension == 3 else self.table.axes or "xy"
+        if self.table.axes and self.check.dimension == 3:
             self.check.report(("picture", "axes"), "is for pictures in the plane: remove it")
         return Picture(tuple(shapes), axes)
 
-    def _declare(self, name: str, at: tuple[float | str, ...]) -> None:
+    def _declare(self, name: str, at: tuple[Value, ...]) -> None:
         path = ("picture", "points", name)
-        if why := names.fault(name):
-            self.check.report(path, why)
-        elif name == WORLD or name in self.bodies:
-            what = "the frame that does not move" if name == WORLD else "a body or point already"
-            self.check.report(path, f"'{name}' is {what}: name the point otherwise")
+        taken = {**dict.fromkeys(self.bodies, "is a body or point already"), **WORLD_TAKEN}
+        self.check.claim(path, name, taken, "")
         self.points[name] = self._vector(path, at)
 
     def _simple(self) -> Iterator[Shape]:
@@ -355,12 +618,15 @@ class _Picture:
             path = ("picture", key)
             for at, size, rotation in getattr(self.table, key):
                 place = self._place(path, at)
-                if kind == "box" and self.dimension and len(size) != self.dimension:
-                    where = "in the plane" if self.dimension == 2 else "in space"
-                    words = "two edges" if self.dimension == 2 else "three edges"
+                if kind == "box" and len(size) != (self.check.dimension or len(size)):
+                    where = "in the plane" if self.check.dimension == 2 else "in space"
+                    words = "two edges" if self.check.dimension == 2 else "three edges"
                     self.check.report(path, f"a box {where} has {words}, here {len(size)}")
-                large = tuple(self._size(path, entry) for entry in size)
-                yield Shape(kind, (place,), large, self._rotation(path, rotation))
+                extent = (*path, "size" if kind == "box" else "radius")
+                large = tuple(self.check.value(extent, x, nonnegative=True)[0] for x in size)
+                yield Shape(
+                    kind, (place,), large, self.check.rotation(path, rotation, self._formula)
+                )
 
     def _place(self, path: Path, written: Written) -> PicturePlace:
         if not isinstance(written, str):
@@ -375,46 +641,17 @@ class _Picture:
         self.check.report(path, f"'{written}' is no point{remedy}", text=written)
         return PicturePlace(written, ORIGIN)
 
-    def _vector(self, path: Path, entries: tuple[float | str, ...]) -> Vector:
-        self.dimension = self.dimension or (len(entries) if len(entries) in (2, 3) else 0)
-        if len(entries) != self.dimension:
-            words = {2: "two entries, as the others here", 3: "three entries, as the others here"}
-            count_text = words.get(self.dimension, "two entries in the plane and three in space")
-            self.check.report(path, f"a point has {count_text}, not {len(entries)}")
-            return ORIGIN
-        checked = [self._formula(path, entry) for entry in entries]
-        x, y, z = (*checked, ZERO)[:3]
-        return x, y, z
+    def _vector(self, path: Path, entries: tuple[Value, ...]) -> Vector:
+        if self.check.dimension not in (2, 3) and len(entries) in (2, 3):
+            self.check.dimension = len(entries)
+        return self.check.vector(path, entries, self._formula)
 
-    def _formula(self, path: Path, value: float | str) -> Formula:
+    def _formula(self, path: Path, value: Value) -> Formula:
         """Return a checked formula, which may use all names except inputs and velocities."""
-        check = self.check
-        formula = check.formula(path, value)
+        formula = self.check.formula(path, value)
         if formula is None:
             return ZERO
-        kinds = check.kinds_of(formula.tree)
         for kind in (INPUT, VELOCITY):
-            if kind in kinds:
-                why = f"a picture can't depend on {kind}: it shows where things are"
-                check.report(path, why, check.find_part(formula, kind), formula.text)
+            why = f"a picture can't depend on {kind}: it shows where things are"
+            self.check.depends_on(path, formula, kind, why)
         return formula
-
-    def _size(self, path: Path, value: float | str) -> Formula:
-        """Return a checked length, a formula of parameters that is not negative."""
-        rule = "a size is made of numbers, constants and parameters"
-        formula = self.check.formula(path, value, self.known, rule)
-        if self.check.number(path, formula, self.known) < 0:
-            self.check.report(path, "a size is not negative", text=formula.text if formula else "")
-        return formula or ZERO
-
-    def _rotation(self, path: Path, rotation: Any) -> tuple[Turn, ...]:
-        if rotation is None:
-            return ()
-        if not isinstance(rotation, tuple):
-            if self.dimension == 3:
-                why = 'in space a rotation names its axis: write [["z", "pi/2"]], or more turns'
-                self.check.report(path, why)
-            return (Turn("z", self._formula(path, rotation)),)
-        if self.dimension == 2 and any(axis != "z" for axis, _ in rotation):
-            self.check.report(path, "in the plane a rotation is an angle: write it alone")
-        return tuple(Turn(axis, self._formula(path, angle)) for axis, angle in rotation)

@@ -480,12 +480,13 @@ _LOCK_FLAGS = ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC")  # missing, and not need
 
 
 @contextmanager
-def hold_lock(path: Path) -> Iterator[None]:
+def hold_lock(path: Path, refusal: str = "") -> Iterator[None]:
     """Hold an exclusive lock on the file `path` while the block of the with statement runs.
 
     Other processes that lock the same file wait until the block ends. If the file does not exist,
-    an empty one is created. Raises EomcError if `path` is a symbolic link, a folder, a pipe or
-    anything else that is not a regular file.
+    an empty one is created. refusal: message of the EomcError that is raised at once if another
+    process holds the lock; "" to wait. Raises EomcError if `path` is a symbolic link, a folder, a
+    pipe or anything else that is not a regular file.
     """
     try:
         flags = os.O_RDWR | os.O_CREAT
@@ -499,28 +500,33 @@ def hold_lock(path: Path) -> Iterator[None]:
     try:
         if not stat.S_ISREG(os.fstat(lock).st_mode):
             raise EomcError(_LOCK_REFUSED.format(path))
-        _wait(lock)
+        _wait(lock, refusal)
         yield
     finally:
         os.close(lock)
 
 
-def _wait(lock: int) -> None:
-    """Wait for the exclusive lock; closing the file releases it."""
+def _wait(lock: int, refusal: str) -> None:
+    """Wait for the exclusive lock, or raise EomcError(refusal); closing the file releases it."""
     if sys.platform == "win32":
         import msvcrt
 
         while True:
             try:
-                msvcrt.locking(lock, msvcrt.LK_LOCK, 1)  # first byte, which need not exist
-                return
+                msvcrt.locking(lock, msvcrt.LK_NBLCK if refusal else msvcrt.LK_LOCK, 1)
+                return  # the first byte is locked, which need not exist
             except OSError as fault:  # LK_LOCK gives up after ten seconds
+                if refusal and fault.errno == errno.EACCES:
+                    raise EomcError(refusal) from None
                 if fault.errno != errno.EDEADLK:
                     raise
     else:
         import fcntl
 
-        fcntl.flock(lock, fcntl.LOCK_EX)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | (fcntl.LOCK_NB if refusal else 0))
+        except BlockingIOError:
+            raise EomcError(refusal) from None
 
 
 # --- cached texts ---------------------------------------------------------------------------------

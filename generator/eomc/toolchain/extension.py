@@ -10,8 +10,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from eomc.toolchain.compiler import STANDARD, Compiler, binding_flags, flags, standard
-from eomc.toolchain.subprocesses import run, try_load
+from eomc.toolchain.compiler import (
+    STANDARD,
+    Compiler,
+    binding_flags,
+    flags,
+    run,
+    standard,
+    try_load,
+)
 
 if TYPE_CHECKING:
     from eomc.emit.render import Sources

@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from eomc.base.errors import EomcError, NoCompilerError
-from eomc.toolchain.compiler import Compiler, compiler_for, flags, standard
+from eomc.toolchain.compiler import Compiler, compiler_for, flags, run, standard, try_load
 from eomc.toolchain.files import write_archive, write_files
-from eomc.toolchain.subprocesses import run, try_load
 
 if TYPE_CHECKING:
-    from eomc.emit.fmu.unit import Unit
+    from eomc.emit.fmu import Unit
 
 _SUFFIX = {"win32": ".dll", "cygwin": ".dll", "darwin": ".dylib"}
 _MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}

@@ -15,8 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from eomc.base.errors import EomcError
-from eomc.toolchain.compiler import PLAIN_STANDARD, Compiler, user_flags
-from eomc.toolchain.subprocesses import run
+from eomc.toolchain.compiler import PLAIN_STANDARD, Compiler, run, user_flags
 
 DEFAULT_FLAGS = ("-Os",)  # without EOMC_CFLAGS
 # small machines have no unwind tables for debuggers

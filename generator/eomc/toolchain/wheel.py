@@ -19,8 +19,9 @@ from pathlib import Path
 
 from eomc.base import texts
 from eomc.base.resources import __version__
-from eomc.emit.package import CompiledView, Form
-from eomc.emit.render import Sources, show
+from eomc.emit.common.templates import show
+from eomc.emit.package import Form
+from eomc.emit.render import Sources
 from eomc.toolchain import extension
 from eomc.toolchain.compiler import FLAGS, compiler_for, user_flags
 from eomc.toolchain.files import write_archive, write_files
@@ -104,7 +105,9 @@ def build(sources: Sources, scene: bytes, digest: str, title: str, folder: Path)
             extension.build(sources, module, build_folder, library, compiler, "fast", g.flags)
             files[library] = (build_folder / library).read_bytes()
             forms.append(Form(g.name, module, g.needs))
-    files[f"{COMPILED}.py"] = show(CompiledView(name, __version__, tuple(forms))).encode()
+    files[f"{COMPILED}.py"] = show(
+        "python/compiled.py", prefix=name, version=__version__, forms=forms
+    ).encode()
     version = f"{__version__}+scene{digest[:12]}"
     tag = f"{python}-{abi}-{_platform(files)}"
     info = f"{name}-{version}.dist-info"

@@ -18,31 +18,21 @@ wherever a measurement is possible:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from eomc.integrators.tableaux import METHODS, RK4
+from eomc.runtime import rank
 from eomc.verify import one_step
-from eomc.verify.reference import Vector
-from eomc.verify.report import Measurement
-from eomc.verify.sampling import (
-    MAX_DISTANCE,
-    NUDGE,
-    State,
-    evaluate_module,
-    projected_start,
-    simulate,
-    states_of_run,
-)
+from eomc.verify.comparison import Check, Comparison, Measurement
+from eomc.verify.reference import Vector, differences
+from eomc.verify.sampling import EPS, MAX_DISTANCE, NUDGE, Expected, State, states_of_run
 
-EPS = 2.0**-52
-MAX_OBSERVABLE_ORDER = 8  # with higher orders, two halvings of h lead from 1e-2 to rounding
-ORDER_MARGIN = 0.5  # an observed order may be lower than the order of the method by this
 NOISE_FACTOR = 30.0  # differences above this multiple of rounding errors are due to the method
 ORDER_TOLERANCE = 0.3  # orders that differ by less are the same
 COUNTS = (6, 12, 24, 48, 96)  # numbers of steps over one time span
@@ -50,21 +40,61 @@ COUNTS = (6, 12, 24, 48, 96)  # numbers of steps over one time span
 START_POWERS = (-2, -4, -7, -10, -14, -20)
 
 
+def checks(comparison: Comparison) -> Iterator[Check]:
+    """Yield the checks of orders, of the power balance and of advised step sizes.
+
+    There are none in single precision, in which differences have too few digits.
+    """
+    if comparison.dtype != np.float64:
+        return
+    runs = Convergence(comparison)
+    excuse = f" not to be expected with {comparison.corners}" if comparison.corners else ""
+
+    def order_check(
+        name: str, measure: Callable[[], Measurement], least: float, unit: str
+    ) -> Check:
+        return Check(
+            name, lambda *_: measure(), tolerance=least, states=(None,), unit=unit, minimum=True,
+            excuse=excuse and unit + excuse,
+        )  # fmt: skip
+
+    for method in comparison.methods:
+        measure = partial(runs.order, method)
+        yield order_check(f"order of {method}", measure, least_order(method), "order observed")
+    unit = "order at which it closes"
+    yield order_check("power balance", runs.closing, runs.closing_limit, unit)
+    yield from advice_checks(comparison, runs)
+
+
+def advice_checks(comparison: Comparison, runs: Convergence) -> Iterator[Check]:
+    """Yield the checks of the step sizes h that the module advises, for each method.
+
+    They pass if runs with an eighth of the advised h are stable and runs with twice that h are
+    unstable.
+    """
+    advice, corners = Advice(runs), comparison.corners
+    for method in comparison.methods:
+        if math.isfinite(min(METHODS[method].limits)):
+            yield Check(
+                f"h of {method}", lambda *_, m=method: advice.failing_fraction(m),
+                tolerance=PARTS[0], states=(None,), minimum=True,
+                unit="of the advised h, where runs are lost",
+                excuse=f"no matter with {corners}" if corners else "",
+            )  # fmt: skip
+
+
+def least_order(method: str) -> float:
+    """Return the least accepted order of a method: half an order less than its own, at most 8.
+
+    With higher orders, two halvings of h lead from 1e-2 to rounding.
+    """
+    return min(METHODS[method].order, 8) - 0.5
+
+
 class _End(Protocol):
     """Scaled final states (2, nq) of runs from a state; None if a run stops early."""
 
     def __call__(self, s: State, *, span: float, steps: int) -> Vector | None: ...
-
-
-@dataclass(frozen=True)
-class Place:
-    """An initial state for runs, with the size of its energy.
-
-    energy: that size, in J. A rounding error of the energy is eps times it.
-    """
-
-    state: State
-    energy: float
 
 
 @dataclass(frozen=True)
@@ -119,40 +149,21 @@ class _Ladder:
 class Convergence:
     """Checks of one module by runs with several step sizes: orders of convergence, power balance.
 
-    Parameters
-    ----------
-    module : module
-        The compiled module.
-    methods : sequence of str
-        Its integration methods.
-    places : sequence of Place
-        Initial states of the runs, with the scene's own parameters.
-    start : State
-        The initial state of the scene.
-    scale : (2, nq) array
-        Typical sizes of q and of q̇.
-    h, duration : float
-        Step size and duration of the scene's run, s.
+    places: initial states of the runs, with the scene's own parameters.
     """
 
-    def __init__(
-        self, module: Any, methods: Sequence[str], places: Sequence[Place], start: State,
-        scale: Vector, h: float, duration: float,
-    ) -> None:  # fmt: skip
-        self.module, self.methods, self.places, self.start = module, tuple(methods), places, start
-        self.scale, self.h, self.duration = scale, h, duration
-
-    def run(self, s: State, method: str, **how: Any) -> Any:
-        """Return the module's run by `method` from the state `s`, even if the run stops early.
-
-        how: further arguments of the module's `simulate`, such as h and steps.
-        """
-        if method != self.methods[0]:
-            how["method"] = method
-        if getattr(self.module, "constraint_names", ()):  # they may depend on time
-            how.setdefault("t0", s.t)
-            s = projected_start(self.module, s)
-        return simulate(self.module, s, **how)
+    def __init__(self, of: Comparison) -> None:
+        self.of, self.module, self.methods = of, of.module, of.methods
+        self.scale, self.h, self.duration = (
+            of.sampler.scale,
+            of.system.run.h,
+            of.system.run.duration,
+        )
+        own = [e for e in of.expected if e.state.params is None]
+        typical = own[1:4] or of.expected[:3]  # away from the start
+        self.places = [
+            replace(e, state=replace(e.state, t=of.start_time(e.state))) for e in typical
+        ]
 
     def end(self, s: State, method: str, span: float, steps: int) -> Vector | None:
         """Return the final state of a run by `method` from `s`, divided by the scale, (2, nq).
@@ -160,12 +171,12 @@ class Convergence:
         The run has `steps` steps over `span` seconds. The scale consists of typical sizes of q and
         q̇. The result is None if the run stops early.
         """
-        run = self.run(s, method, h=span / steps, steps=steps, every=steps)
+        run = self.of.simulate(s, method, h=span / steps, steps=steps, every=steps)
         if str(run.status) != "ok":
             return None
-        return np.array([run.q[-1], run.qd[-1]]) / self.scale
+        return np.asarray(np.array([run.q[-1], run.qd[-1]]) / self.scale)
 
-    def noise(self, at: Place, end: _End, span: float, steps: int, there: Vector) -> float:
+    def noise(self, at: Expected, end: _End, span: float, steps: int, there: Vector) -> float:
         """Return how far rounding moves the final state of a run, divided by the scale.
 
         Runs start at states that differ from that of `at` by one rounding error. The result is the
@@ -173,7 +184,7 @@ class Convergence:
 
         Parameters
         ----------
-        at : Place
+        at : Expected
             The initial state of the run.
         end : callable
             Returns the scaled final state of a run of `steps` steps over `span` seconds.
@@ -204,7 +215,7 @@ class Convergence:
         order can't be judged. Raises RuntimeError if from one of the initial states no run reaches
         its end.
         """
-        least = min(METHODS[method].order, MAX_OBSERVABLE_ORDER) - ORDER_MARGIN
+        least = least_order(method)
         orders = []
         for at in self.places:
             orders.append(self._order(at, method, least))
@@ -212,7 +223,7 @@ class Convergence:
                 break  # a wrong stepper has a low order at every state
         return _pick_order(orders, max, "too few halvings between rounding and a hundredth")
 
-    def _order(self, at: Place, method: str, least: float) -> float:
+    def _order(self, at: Expected, method: str, least: float) -> float:
         """Return the best order over a few spans; else over longer and longer spans.
 
         These begin with the shortest that shows a difference. A low order counts if two successive
@@ -246,7 +257,7 @@ class Convergence:
             raise RuntimeError(f"no run by {method} gets to its end")
         return math.nan if moved else math.inf
 
-    def _has_kink(self, at: Place, method: str, span: float) -> bool:
+    def _has_kink(self, at: Expected, method: str, span: float) -> bool:
         """Return whether another method has a low order over the span too: it contains a kink.
 
         RK4 on the module's accelerations is one, beside those that the module has.
@@ -254,10 +265,10 @@ class Convergence:
         others: list[tuple[str, _End]] = [
             (m, partial(self.end, method=m)) for m in self.methods if m != method
         ]
-        if not getattr(self.module, "constraint_names", ()):
+        if not self.of.system.constraints:
             others.append((RK4.name, self._end_by_hand))
         for name, end in others:
-            least = min(METHODS[name].order, MAX_OBSERVABLE_ORDER) - ORDER_MARGIN
+            least = least_order(name)
             one = self._ladder(at, end, span)
             if one and math.isnan(one.best(least)) and sum(clear for _, clear in one.orders) > 1:
                 return True
@@ -267,7 +278,7 @@ class Convergence:
         """Return the same as `end`, by RK4 in Python."""
 
         def acceleration(q: Vector, qd: Vector, t: float) -> Vector:
-            return self.module_value("acceleration", replace(s, q=q, qd=qd, t=t))
+            return self.of.module_value("acceleration", replace(s, q=q, qd=qd, t=t))
 
         x, h = np.array([s.q, s.qd]), span / steps
         with np.errstate(all="ignore"):
@@ -275,52 +286,13 @@ class Convergence:
                 x = one_step.step(RK4, acceleration, x[0], x[1], s.t + k * h, h)
         return x / self.scale if np.isfinite(x).all() else None
 
-    def _ladder(self, at: Place, end: _End, span: float) -> _Ladder | None:
+    def _ladder(self, at: Expected, end: _End, span: float) -> _Ladder | None:
         ends = [end(at.state, span=span, steps=n) for n in COUNTS]
         known = [end for end in ends if end is not None]
         if ends[2] is None or any(e is None for e in ends[-len(known) :]):
             return None
         off = tuple(float(np.max(np.abs(b - a))) for a, b in pairwise(known))
         return _Ladder(span, off, self.noise(at, end, span, COUNTS[2], ends[2]))
-
-    # --- two methods ------------------------------------------------------------------------------
-
-    def compare_methods(self, method: str) -> Measurement:
-        """Return how far final states by `method` differ from those by the module's first method.
-
-        The unit is the sum of the changes of both final states when h is halved. For each initial
-        state, runs of two durations are compared and the smaller result counts, since for one
-        duration these changes may vanish by chance. The result is the median over the initial
-        states.
-        """
-        ratios = [self._method_difference(at, method) for at in self.places]
-        known = [x for x in ratios if not math.isnan(x)]
-        if known:
-            return Measurement(float(np.median(known)))
-        return Measurement(math.nan, "no span is short enough for the two methods' steps")
-
-    def _method_difference(self, at: Place, method: str) -> float:
-        ratios: list[float] = []
-        for power in range(0, -20, -2):
-            span = 24 * self.h * 2.0**power
-            ends = [
-                self.end(at.state, name, span, n)
-                for name in (self.methods[0], method)
-                for n in (24, 48)
-            ]
-            if any(end is None for end in ends):
-                continue
-            one, two, far, other = (np.asarray(end) for end in ends)
-            change = np.abs(two - one) + np.abs(other - far)
-            if float(np.max(change)) > 1e-3:  # the methods have not converged
-                continue
-            noise = self.noise(at, partial(self.end, method=method), span, 48, other)
-            ratios.append(
-                float(np.max(np.abs(two - other)) / (np.max(change) + 2 * NOISE_FACTOR * noise))
-            )
-            if len(ratios) == 2 or ratios[-1] <= 1:
-                break
-        return min(ratios, default=math.nan)
 
     # --- power ------------------------------------------------------------------------------------
 
@@ -345,7 +317,7 @@ class Convergence:
         orders = [self._closing(at) for at in self.places]
         return _pick_order(orders, min, "the balance is neither closed nor left open")
 
-    def _closing(self, at: Place) -> float:
+    def _closing(self, at: Expected) -> float:
         """Return the order of the balance over spans of increasing length, until it has a residual.
 
         A residual that two halvings of h do not change, in two successive spans, means a wrong
@@ -371,7 +343,7 @@ class Convergence:
                 return order
         return math.inf if closed else math.nan
 
-    def _gap_persists(self, at: Place, span: float, rest: float) -> bool:
+    def _gap_persists(self, at: Expected, span: float, rest: float) -> bool:
         """Return whether the balance has the same residual near that state."""
         s = at.state
         # a change by 1e-3 hardly changes smooth functions, but it changes their rounding errors
@@ -380,28 +352,26 @@ class Convergence:
         gaps = [self._gaps(x, span)[0][-1:] for x in near]
         return all(x and abs(x[0] - rest) <= 0.1 * abs(rest) for x in gaps)
 
-    def _gaps(self, at: Place, span: float) -> tuple[list[float], bool]:
+    def _gaps(self, at: Expected, span: float) -> tuple[list[float], bool]:
         """Return the residual of the balance for 16, 32 and 64 steps, and whether one closes."""
         s, gaps = at.state, []
         for n in (16, 32, 64):
-            run = self.run(s, self._best_method, h=span / n, steps=n)
+            run = self.of.simulate(s, self._best_method, h=span / n, steps=n)
             if str(run.status) != "ok":
                 return [], False
             states = states_of_run(run, s)
-            power = np.array([self.module_value("power", row) for row in states])
+            power = np.array([self.of.module_value("power", row) for row in states])
             simpson = np.array([1, *(4, 2) * (n // 2 - 1), 4, 1]) * span / n / 3
-            after, before = (self.module_value("jacobi", states[i]) for i in (-1, 0))
+            after, before = (self.of.module_value("jacobi", states[i]) for i in (-1, 0))
             gaps.append(float(after - before - simpson @ power))
             names = ("kinetic_energy", "potential_energy")
-            sizes = [np.abs(self.module_value(name, states[i])) for name in names for i in (0, -1)]
-            energy = at.energy + float(simpson @ np.abs(power) + sum(sizes))
+            sizes = [
+                np.abs(self.of.module_value(name, states[i])) for name in names for i in (0, -1)
+            ]
+            energy = float(at.size["jacobi"]) + float(simpson @ np.abs(power) + sum(sizes))
             if abs(gaps[-1]) <= 1e3 * EPS * energy:
                 return gaps, True
         return (gaps if np.all(np.isfinite(gaps)) else []), False
-
-    def module_value(self, name: str, s: State) -> Vector:
-        """Return the module's value `name`, such as "power" or "jacobi", at the state `s`."""
-        return evaluate_module(self.module, name, s)
 
 
 def _pick_order(
@@ -412,7 +382,8 @@ def _pick_order(
     orders = [x for x in known if math.isfinite(x)]
     if orders:
         return Measurement(pick(orders))
-    return Measurement(math.inf) if known else Measurement(math.nan, why)
+    exact = "every run is exact up to rounding"
+    return Measurement(math.inf, exact) if known else Measurement(math.nan, why)
 
 
 # --- advised step sizes ---------------------------------------------------------------------------
@@ -425,20 +396,18 @@ MAX_END_ERROR = 0.1  # relative to the motion: a run with longer steps than advi
 # change of the initial state, relative to the motion; so small that it grows linearly with stiff
 # forces too
 SMALL_PERTURBATION = 1e-9
-ZERO_TOLERANCE = 1e-9  # relative to the largest singular value: smaller ones are 0
 
 
 class Advice:
     """Checks of the step sizes h that a compiled module advises, by runs with other step sizes.
 
-    runs: the runs of the module with several step sizes, and the data of its scene. holonomic: for
-    each constraint equation, whether it restricts positions (holonomic) rather than velocities.
+    runs: the runs of the module with several step sizes.
     """
 
-    def __init__(self, runs: Convergence, holonomic: Sequence[bool] = ()) -> None:
-        self.holonomic = np.array(holonomic, bool)
-        self.runs, self.start, self.scale, self.h = runs, runs.start, runs.scale, runs.h
-        self.duration = runs.duration
+    def __init__(self, runs: Convergence) -> None:
+        self.of, self.runs = runs.of, runs
+        self.start, self.scale = self.of.expected[0].state, runs.scale
+        self.holonomic = np.array([c.holonomic for c in self.of.system.constraints], bool)
 
     def failing_fraction(self, method: str) -> Measurement:
         """Return the least multiple of the advised h, one of PARTS, with which a run is unstable.
@@ -456,14 +425,14 @@ class Advice:
         """
         if method == "euler" and self._velocities_matter():
             return Measurement(math.inf, "for forces of positions alone")
-        longest = self._longest_advised(method, self.stiffest_state, 1e3 * self.duration)
+        longest = self._longest_advised(method, self.stiffest_state, 1e3 * self.runs.duration)
         if math.isinf(longest):
             return Measurement(math.inf, "no mode turns or decays")
         eigen = self._step_by_eigenvalues(method)
         ratio = max(longest / eigen, eigen / longest)
         unit = "times the eigenvalues' h; runs leave where it holds"
         near = Measurement(ratio, unit=unit, limit=2) if ratio <= 2 else None
-        if near and longest > self.duration:
+        if near and longest > self.runs.duration:
             return near
         fine, grown = self._ends(method, longest, 1 / 64)
         if not math.isfinite(grown):
@@ -485,11 +454,11 @@ class Advice:
         long for the motion, later states are as large as 1e40 and differences have no digits left.
         """
         start = self.start
-        method = next(m for m in self.runs.methods if math.isfinite(min(METHODS[m].limits)))
-        steps = min(2000, math.ceil(self.duration / self.h))
+        method = next(m for m in self.of.methods if math.isfinite(min(METHODS[m].limits)))
+        steps = min(2000, math.ceil(self.runs.duration / self.runs.h))
         every = max(1, steps * max(1, len(start.q) // 8) // 256)  # at most 256 states
-        stiffest, longest = start, 1e3 * self.duration
-        run = self.runs.run(start, method, steps=steps, every=every)
+        stiffest, longest = start, 1e3 * self.runs.duration
+        run = self.of.simulate(start, method, steps=steps, every=every)
         for s in states_of_run(run, start):
             if not np.all(np.abs([s.q - start.q, s.qd - start.qd]) < MAX_DISTANCE * self.scale):
                 break
@@ -514,12 +483,12 @@ class Advice:
         """True if accelerations depend on velocities."""
         s = self.runs.places[-1].state
         at_rest = replace(s, qd=0 * s.qd)
-        one, other = (self.runs.module_value("acceleration", x) for x in (s, at_rest))
+        one, other = (self.of.module_value("acceleration", x) for x in (s, at_rest))
         return not np.array_equal(one, other)
 
     def _warns(self, method: str, s: State, h: float) -> bool:
         """True if the module advises against h at a state."""
-        message = self.runs.module.advice(s.q, s.qd, h, params=s.params, method=method, t0=s.t)
+        message = self.of.module.advice(s.q, s.qd, h, params=s.params, method=method, t0=s.t)
         return message is not None
 
     def _ends(self, method: str, longest: float, part: float) -> tuple[Vector, float]:
@@ -537,7 +506,7 @@ class Advice:
         for by in (0.0, NUDGE, SMALL_PERTURBATION):
             q, qd = np.array([s.q, s.qd]) + by * signs * self.scale
             how = {"h": part * longest, "steps": steps, "every": steps, "t0": s.t}
-            run = self.runs.run(replace(s, q=q, qd=qd), method, **how)
+            run = self.of.simulate(replace(s, q=q, qd=qd), method, **how)
             if str(run.status) != "ok":
                 return np.full(self.scale.shape, math.inf), math.inf
             ends.append(np.array([run.q[-1], run.qd[-1]]) / self.scale)
@@ -562,20 +531,21 @@ class Advice:
     def _eigenvalue_limit(self, method: str, directions: Vector) -> float:
         """Return the longest stable h, s, for changes of [q; q̇] in the span of `directions`."""
         s = self.stiffest_state
-        n, x = len(s.q), np.array([s.q, s.qd])
-        rates = np.zeros_like(directions)
-        for k, direction in enumerate(directions.T):
-            by = SMALL_PERTURBATION**0.5 * 1e-2 * direction.reshape(2, n) * self.scale
-            try:
-                ends = [
-                    self.runs.module_value("acceleration", replace(s, q=moved[0], qd=moved[1]))
-                    for moved in (x + by, x - by)
-                ]
-            except ArithmeticError:  # off the constraints there may be none
-                return 0.0
-            change = np.array([2 * by[1], ends[0] - ends[1]])
-            rates[:, k] = (change / (2 * SMALL_PERTURBATION**0.5 * 1e-2 * self.scale)).ravel()
-        values = np.linalg.eigvals(directions.T @ rates)
+        x, step = np.array([s.q, s.qd]), SMALL_PERTURBATION**0.5 * 1e-2
+
+        def rates(rows: Vector) -> list[Vector]:
+            states = x + (rows @ directions.T).reshape(-1, *x.shape) * self.scale
+            return [
+                np.array([qd, self.of.module_value("acceleration", replace(s, q=q, qd=qd))])
+                / self.scale
+                for q, qd in states
+            ]
+
+        try:
+            slopes = differences(rates, zeros := np.zeros(len(directions.T)), zeros + step)
+        except ArithmeticError:  # off the constraints there may be none
+            return 0.0
+        values = np.linalg.eigvals(directions.T @ slopes)
         turning, decay = METHODS[method].limits
         rate = np.max(np.abs(values.imag)) / turning, np.max(-values.real) / decay
         fastest = float(max(rate))
@@ -590,23 +560,14 @@ class Advice:
         n, (far, fast) = len(s.q), self.scale
         if not self.holonomic.size:
             return np.eye(2 * n)
-        A = evaluate_module(self.runs.module, "constraint_jacobian", s)
-        of_q, of_qd = _null_space(A[self.holonomic] * far), _null_space(A * fast)
-        rates = np.zeros((len(A), of_q.shape[1]))
-        for k, direction in enumerate(of_q.T):
-            ends = (
-                evaluate_module(
-                    self.runs.module, "constraint_rates", replace(s, q=s.q + by * far * direction)
-                )
-                for by in (1e-5, -1e-5)
-            )
-            rates[:, k] = (next(ends) - next(ends)) / 2e-5
-        follow = -np.linalg.pinv(A * fast, rcond=ZERO_TOLERANCE) @ rates
+        A = self.of.module_value("constraint_jacobian", s)
+        of_q, of_qd = rank.null_space(A[self.holonomic] * far), rank.null_space(A * fast)
+
+        def rates(rows: Vector) -> list[Vector]:
+            states = s.q + (rows @ of_q.T) * far
+            return [self.of.module_value("constraint_rates", replace(s, q=q)) for q in states]
+
+        slopes = differences(rates, zeros := np.zeros(len(of_q.T)), zeros + 1e-5)
+        follow = -np.linalg.pinv(A * fast, rcond=rank.tolerance()) @ slopes
         whole = np.block([[of_q, np.zeros((n, of_qd.shape[1]))], [follow, of_qd]])
         return np.asarray(np.linalg.qr(whole)[0])
-
-
-def _null_space(A: Vector) -> Vector:
-    """Return an orthonormal basis of the null space of A, (n, k)."""
-    _, sizes, rows = np.linalg.svd(A)
-    return np.asarray(rows[np.sum(sizes > ZERO_TOLERANCE * np.max(sizes, initial=0)) :].T)

@@ -18,6 +18,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from eomc.runtime import rank
+
 Vector = NDArray[np.float64]
 
 EIGENVALUE_TOLERANCE = 1e-6  # smaller eigenvalues of the scaled D may have either sign
@@ -123,28 +125,21 @@ def scales(D: Vector, A: Vector) -> Vector:
     return np.concatenate([coordinates, 1 / np.where(rows > 0, rows, 1)])
 
 
-def least_eigenvalue_on_constraints(D: Vector, A: Vector) -> float:
-    """Return the least eigenvalue of D on the null space of A, after scaling D to a unit diagonal.
+def is_nonnegative(D: Vector, A: Vector) -> bool:
+    """Return whether vᵀ D v >= 0 for all v with A v = 0; True if that can't be decided.
 
-    D (n, n) is the mass matrix, and the null space of A contains the velocities that the
-    constraints permit. The result is nan if a value is not finite, or if rows of A are zero or
-    linearly dependent.
+    D (n, n) is the mass matrix, scaled here to a unit diagonal, and v are the velocities that the
+    constraints permit. If rows of A are zero or linearly dependent, the result is True.
     """
+    if not (np.all(np.isfinite(D)) and np.all(np.isfinite(A))):
+        return True
     size = np.sqrt(np.abs(np.diag(D)))
     size = np.where(size > 0, size, 1.0)
-    rows = np.linalg.norm(A / size, axis=1)
-    if not (np.all(np.isfinite(D)) and np.all(np.isfinite(A)) and np.all(rows > 0)):
-        return np.nan
-    _, s, V = np.linalg.svd(A / size / rows[:, None])
-    if len(s) and s[-1] < EIGENVALUE_TOLERANCE:
-        return np.nan
-    N = V[len(s) :].T
-    return float(np.linalg.eigvalsh(N.T @ (D / np.outer(size, size)) @ N)[0]) if N.size else 0.0
-
-
-def is_nonnegative(D: Vector, A: Vector) -> bool:
-    """Return whether vᵀ D v >= 0 for all v with A v = 0; True if that can't be decided."""
-    return not least_eigenvalue_on_constraints(D, A) < -EIGENVALUE_TOLERANCE
+    N = rank.null_space(A / size)
+    if N.shape[1] != D.shape[0] - len(A):
+        return True
+    values = np.linalg.eigvalsh(N.T @ (D / np.outer(size, size)) @ N)
+    return not np.any(values < -EIGENVALUE_TOLERANCE)
 
 
 def project_to_nearest(

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from eomc.integrators.tableaux import Method
-from eomc.verify.reference import Vector
+from eomc.verify.kkt import Vector
 
 MAX_SWEEPS = 20  # iterations for the stages of an implicit method, with a contraction by 1/7
 CONVERGENCE_TOLERANCE = 4 * 2.0**-52  # relative change of the stages by the last iteration

@@ -1,7 +1,7 @@
 """The interface of independent references, with RK4 in plain Python.
 
-`symbolic.SymbolicReference` evaluates expressions written out, `taylor.TaylorReference` uses Taylor
-arithmetic along the definitions. Both take many states at once, as leading rows of their arguments.
+`symbolic.SymbolicReference` evaluates expressions written out, `taylor.TaylorReference` uses dual
+numbers along the definitions. Both take many states at once, as leading rows of their arguments.
 Constraints are solved by `kkt`. `DiscreteReference` adds the parameters that jumps at events set to
 one of the two, as discrete variables: each has D = 1, no other entry in its rows, and the kinetic
 energy s_dot**2/2.
@@ -12,16 +12,17 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from eomc.base.errors import EomcError
+from eomc.integrators.tableaux import RK4
 from eomc.model.system import System
 from eomc.scene.formulas import suggest
-from eomc.verify import kkt
+from eomc.verify import kkt, one_step
 
 ROWS, RATES = ("D", "constraint_jacobian", "constraints"), "constraint_rates"
 # multiples of the width, and weights, of central differences of order 8 (Fornberg, 1988)
@@ -97,37 +98,54 @@ class ReferenceModel(ABC):
         qd = np.zeros_like(q) if qd is None else np.asarray(qd, float)
         return self.value(name, q, qd, t, u, self._values(params))
 
-    def acceleration(
-        self,
-        q: ArrayLike,
-        qd: ArrayLike,
-        t: ArrayLike = 0.0,
-        u: ArrayLike | None = None,
+    def mass_and_force(
+        self, q: ArrayLike, qd: ArrayLike, t: ArrayLike = 0.0, u: ArrayLike | None = None,
         params: Params = None,
-    ) -> Vector:
+    ) -> tuple[Vector, Vector]:  # fmt: skip
+        """Return D (nq, nq) and the force τ - bias (nq,), with the arguments of `evaluate`."""
+        D, bias, tau = (self.evaluate(name, q, qd, t, u, params) for name in ("D", "bias", "tau"))
+        return D, tau - bias
+
+    def acceleration(
+        self, q: ArrayLike, qd: ArrayLike, t: ArrayLike = 0.0, u: ArrayLike | None = None,
+        params: Params = None,
+    ) -> Vector:  # fmt: skip
         """Return q̈ (nq,) from D q̈ = τ - bias or, under constraints, D q̈ = τ - bias + Aᵀλ.
 
         Arguments are as in `evaluate`. The result is nan if D is singular.
         """
-        q, qd = np.asarray(q, float), np.asarray(qd, float)
-        return self._acceleration(q, qd, t, u, self._values(params))
+        if self.system.constraints:
+            return self._constrained(q, qd, t, u, params)[0]
+        D, force = self.mass_and_force(q, qd, t, u, params)
+        try:
+            return np.asarray(np.linalg.solve(D, force[..., None])[..., 0])
+        except np.linalg.LinAlgError:  # D is singular at one of the states at least
+            accelerations = np.full(force.shape, np.nan)
+            for k in np.ndindex(force.shape[:-1]):
+                with suppress(np.linalg.LinAlgError):
+                    accelerations[k] = np.linalg.solve(D[k], force[k])
+            return accelerations
 
     def multipliers(
-        self,
-        q: ArrayLike,
-        qd: ArrayLike,
-        t: ArrayLike = 0.0,
-        u: ArrayLike | None = None,
+        self, q: ArrayLike, qd: ArrayLike, t: ArrayLike = 0.0, u: ArrayLike | None = None,
         params: Params = None,
-    ) -> Vector:
+    ) -> Vector:  # fmt: skip
         """Return the Lagrange multipliers of the m constraint equations, (m,).
 
         They are the λ of D q̈ = τ - bias + Aᵀλ. The multipliers of redundant equations are 0.
         Arguments are as in `evaluate`.
         """
-        q, qd = np.asarray(q, float), np.asarray(qd, float)
-        _, solved = self._constrained(q, qd, t, u, self._values(params))
-        return np.asarray(solved @ self.solved)
+        return np.asarray(self._constrained(q, qd, t, u, params)[1] @ self.solved)
+
+    def _constrained(
+        self, q: ArrayLike, qd: ArrayLike, t: ArrayLike, u: ArrayLike | None, params: Params
+    ) -> tuple[Vector, Vector]:
+        """Return q̈ and the multipliers of the independent constraints that are solved for."""
+        D, force = self.mass_and_force(q, qd, t, u, params)
+        A, gamma = (
+            self.evaluate(name, q, qd, t, u, params) for name in ("constraint_jacobian", "gamma")
+        )
+        return kkt.solve(D, self.solved @ A, force, -gamma @ self.solved.T)
 
     def project(
         self,
@@ -143,37 +161,114 @@ class ReferenceModel(ABC):
         fixed: indices of coordinates whose position and velocity do not change. nearest: whether
         the resulting q must be the nearest one in that metric; otherwise each single Newton
         correction is the shortest, but not their sum. The results are nan if the iteration does not
-        converge.
+        converge. Nonholonomic constraints alone do not restrict q.
         """
         q, qd = np.asarray(q, float), np.asarray(qd, float)
-        project_one = partial(self._project_state, fixed=fixed, nearest=nearest)
-        return self._map_states(project_one, q, qd, np.asarray(t, float), self._values(params))
+        if q.ndim > 1:
+            times, each = _by_states(t, params, len(q))
+            states = [
+                self.project(*x, {name: values[k] for name, values in each.items()}, fixed, nearest)
+                for k, x in enumerate(zip(q, qd, times, strict=True))
+            ]
+            ends = np.array(states)
+            return ends[:, 0], ends[:, 1]
+        positions = self._holonomic > 0
+
+        def rows(x: Vector) -> tuple[Vector, Vector, Vector]:
+            D, A, off = (self.solved_values(name, x, qd, t, params) for name in ROWS)
+            return *kkt.with_fixed_coordinates(D, A[positions], fixed), off[positions]
+
+        if np.any(positions):
+            project = kkt.project_to_nearest if nearest else kkt.project
+            q, last_correction = project(q, rows)
+            if not last_correction < 1e-10:
+                return np.full_like(q, np.nan), np.full_like(q, np.nan)
+        D, A = (self.solved_values(name, q, qd, t, params) for name in ROWS[:2])
+        D, A = kkt.with_fixed_coordinates(D, A, fixed)
+        for _ in range(2):  # linear in qd; the second time corrects rounding errors
+            off = self.solved_values(RATES, q, qd, t, params)
+            qd = qd + kkt.solve(D, A, np.zeros(len(q)), -off)[0]
+        return q, qd
 
     def corrected(
         self, q: Vector, qd: Vector, t: ArrayLike, params: Params = None
     ) -> tuple[Vector, Vector]:
         """Return q and qd after a step, moved onto the constraints as by generated code.
 
-        q, qd: (nq,), or (b, nq) for b states.
+        q, qd: (nq,), or (b, nq) for b states. Both are corrected together, until corrections of q
+        are small. Both corrections use the matrix before the correction; the velocities are those
+        to the first order in the correction. The results are nan for a state that does not
+        converge.
         """
-        return self._corrected(q, qd, t, self._values(params))
+        if q.ndim == 1:
+            q, qd = self.corrected(q[None], qd[None], t, params)
+            return q[0], qd[0]
+        ends = np.full((2, *q.shape), np.nan)
+        remaining = np.arange(len(q))  # states that have not converged
+        times, each = _by_states(t, params, len(q))
+        for _ in range(12):
+            dq, dqd = self._correction(q, qd, times, each)
+            q, qd = q + dq, qd + dqd
+            size = np.abs(q) + 1e-3 * np.max(np.abs(q), axis=-1, keepdims=True)
+            # the square of such a correction is rounding only
+            small = np.all(np.abs(dq) <= 1e-8 * size, axis=-1)
+            ends[:, remaining[small]] = q[small], qd[small]
+            going_on = ~small & np.all(np.isfinite(q), axis=-1)
+            if not np.any(going_on):
+                break
+            remaining, q, qd, times = (x[going_on] for x in (remaining, q, qd, times))
+            each = {name: x[going_on] for name, x in each.items()}
+        return ends[0], ends[1]
+
+    def _correction(self, q: Vector, qd: Vector, t: Vector, params: Params) -> Vector:
+        """Return one Newton correction of q and of q̇, (2, b, nq)."""
+        rest = np.zeros_like(q)
+        D, A, off = (self.solved_values(name, q, qd, t, params) for name in ROWS)
+        dq, _ = kkt.solve(D, A, rest, -self._holonomic * off)
+        far = np.max(np.abs(dq), axis=-1, keepdims=True)
+        part = np.minimum(1 / 16, DIFFERENCE_STEP / np.maximum(far, DIFFERENCE_STEP))
+        slope = np.zeros_like(off)
+        for k, weight in STENCIL:
+            ends = [
+                self.solved_values(RATES, q + x * dq, qd, t, params) for x in (-k * part, k * part)
+            ]
+            slope += weight / part * (ends[1] - ends[0])
+        moved = self.solved_values(RATES, q, qd, t, params) + slope
+        dqd, _ = kkt.solve(D, A, rest, -moved)
+        return np.stack([dq, dqd])
+
+    def solved_values(
+        self, name: str, q: Vector, qd: ArrayLike, t: ArrayLike, params: Params
+    ) -> Vector:
+        """Return residuals, rates or Jacobian of the r sums of constraint equations in `solved`.
+
+        name: "constraints" or "constraint_rates", (r,), or "constraint_jacobian", (r, nq); or "D".
+        """
+        u = np.zeros((*q.shape[:-1], len(self.system.inputs)))
+        value = np.asarray(self.evaluate(name, q, qd, t, u, params))
+        if name == "D":
+            return value
+        matrix = name == "constraint_jacobian"
+        return np.asarray(self.solved @ value if matrix else value @ self.solved.T)
 
     def step(
-        self,
-        q: ArrayLike,
-        qd: ArrayLike,
-        h: float,
-        t: ArrayLike = 0.0,
-        u: ArrayLike | None = None,
+        self, q: ArrayLike, qd: ArrayLike, h: float, t: ArrayLike = 0.0, u: ArrayLike | None = None,
         params: Params = None,
-    ) -> tuple[Vector, Vector]:
+    ) -> tuple[Vector, Vector]:  # fmt: skip
         """Return q and qd at t + h by one step of the classical Runge-Kutta method of order 4.
 
         The result is corrected onto the constraints. With `u`, inputs are held constant over the
         step; without, they are the scene's signals at every stage.
         """
-        q, qd = np.asarray(q, float), np.asarray(qd, float)
-        return self._step(q, qd, h, np.asarray(t, float), u, self._values(params))
+
+        def acceleration(q: Vector, qd: Vector, t: ArrayLike) -> Vector:
+            return self.acceleration(q, qd, t, u, params)
+
+        x = np.asarray(q, float), np.asarray(qd, float)
+        end, end_qd = one_step.step(RK4, acceleration, *x, np.asarray(t, float), h)
+        if not self.system.constraints:
+            return end, end_qd
+        return self.corrected(end, end_qd, np.add(t, h), params)
 
     def simulate(
         self,
@@ -196,27 +291,19 @@ class ReferenceModel(ABC):
         qd = np.array([c.rate for c in start] if qd0 is None else qd0, float)
         h = self.system.run.h if h is None else h
         steps = round(self.system.run.duration / h) if steps is None else steps
-        values = self._values(params)
-        rows = [(t0, q, qd)]
-        for n in range(steps):
-            q, qd = self._step(q, qd, h, t0 + n * h, u, values)
-            rows.append((t0 + (n + 1) * h, q, qd))
-        times, qs, qds = zip(*rows, strict=True)
-        return np.array(times), np.array(qs), np.array(qds)
-
-    @cached_property
-    def _defaults(self) -> Values:
-        return tuple(p.value for p in self.system.parameters)
+        times, states = t0 + h * np.arange(steps + 1), [(q, qd)]
+        for t in times[:-1]:
+            states.append(self.step(*states[-1], h, t, u, params))
+        qs, qds = zip(*states, strict=True)
+        return np.array(times, float), np.array(qs), np.array(qds)
 
     def _values(self, params: Params) -> Values:
         """Return the parameters in the system's order, with `params` in place of defaults."""
-        if not params:
-            return self._defaults
         values = {p.name: p.value for p in self.system.parameters}
-        for name in params:
+        for name in params or ():
             if name not in values:
                 raise EomcError(f"'{name}' is not a parameter{suggest(name, values)}")
-        return tuple((values | dict(params)).values())
+        return tuple((values | dict(params or {})).values())
 
     @cached_property
     def solved(self) -> Vector:
@@ -244,147 +331,23 @@ class ReferenceModel(ABC):
         rows = self.system.constraints
         return np.array([float(rows[row[0][0]].holonomic) for row in self.system.solved])
 
-    def _acceleration(
-        self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
-    ) -> Vector:
-        if self.system.constraints:
-            return self._constrained(q, qd, t, u, values)[0]
-        D, force = self.mass_and_force(q, qd, t, u, values)
-        try:
-            return np.asarray(np.linalg.solve(D, force[..., None])[..., 0])
-        except np.linalg.LinAlgError:  # D is singular at one of the states at least
-            accelerations = np.full(force.shape, np.nan)
-            for k in np.ndindex(force.shape[:-1]):
-                with suppress(np.linalg.LinAlgError):
-                    accelerations[k] = np.linalg.solve(D[k], force[k])
-            return accelerations
 
-    def _constrained(
-        self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
-    ) -> tuple[Vector, Vector]:
-        """Return q̈ and the multipliers of the independent constraints that are solved for."""
-        D, force = self.mass_and_force(q, qd, t, u, values)
-        A, gamma = (
-            self.value(name, q, qd, t, u, values) for name in ("constraint_jacobian", "gamma")
-        )
-        return kkt.solve(D, self.solved @ A, force, -gamma @ self.solved.T)
+def differences(function: Callable[[Vector], Any], x: Vector, steps: Vector) -> Vector:
+    """Return the derivatives (k, n) of a function at x (n,), by central differences of order 8.
 
-    def _map_states(
-        self, function: Callable[..., tuple[Vector, Vector]], q: Vector, qd: Vector, t: Any,
-        values: Values,
-    ) -> tuple[Vector, Vector]:  # fmt: skip
-        """Apply `function` to each state and return the stacked results."""
-        if q.ndim == 1:
-            return function(q, qd, t, values)
-        times, *each = (by_rows(x, len(q)) for x in (t, *values))
-        params = zip(*each, strict=True) if each else [()] * len(q)
-        ends = np.array([function(*state) for state in zip(q, qd, times, params, strict=True)])
-        return ends[:, 0], ends[:, 1]
+    function: returns k values for each row of an array (m, n). steps (n,): the widths.
+    """
+    rows = x + np.concatenate([k * np.diag(steps) for m, _ in STENCIL for k in (m, -m)])
+    values = np.asarray(function(rows)).reshape(len(STENCIL), 2, len(x), -1)
+    forward, back = np.moveaxis(values, 1, 0)
+    weights = np.array([weight for _, weight in STENCIL])
+    return np.asarray((np.tensordot(weights, forward - back, 1) / steps[:, None]).T)
 
-    def _constraint_values(
-        self, name: str, q: Vector, qd: Vector, t: Any, values: Values
-    ) -> Vector:
-        """Return D, or the value `name` of the independent constraints that are solved for."""
-        u = np.zeros((*q.shape[:-1], len(self.system.inputs)))
-        value = np.asarray(self.value(name, q, qd, t, u, values))
-        if name == "D":
-            return value
-        matrix = name == "constraint_jacobian"
-        return np.asarray(self.solved @ value if matrix else value @ self.solved.T)
 
-    def _project_state(
-        self,
-        q: Vector,
-        qd: Vector,
-        t: Any,
-        values: Values,
-        fixed: tuple[int, ...],
-        nearest: bool,
-    ) -> tuple[Vector, Vector]:
-        """Apply `project` to one state; nonholonomic constraints alone do not restrict q."""
-        positions = self._holonomic > 0
-
-        def rows(x: Vector) -> tuple[Vector, Vector, Vector]:
-            D, A, off = (self._constraint_values(name, x, qd, t, values) for name in ROWS)
-            return *kkt.with_fixed_coordinates(D, A[positions], fixed), off[positions]
-
-        if np.any(positions):
-            project = kkt.project_to_nearest if nearest else kkt.project
-            q, last_correction = project(q, rows)
-            if not last_correction < 1e-10:
-                return np.full_like(q, np.nan), np.full_like(q, np.nan)
-        D, A = (self._constraint_values(name, q, qd, t, values) for name in ROWS[:2])
-        D, A = kkt.with_fixed_coordinates(D, A, fixed)
-        for _ in range(2):  # linear in qd; the second time corrects rounding errors
-            by, _ = kkt.solve(
-                D, A, np.zeros(len(q)), -self._constraint_values(RATES, q, qd, t, values)
-            )
-            qd = qd + by
-        return q, qd
-
-    def _corrected(self, q: Vector, qd: Vector, t: Any, values: Values) -> tuple[Vector, Vector]:
-        """Correct q and q̇ after a step together, until corrections of q are small.
-
-        Both use the matrix before the correction; the velocities are those to the first order in
-        the correction. The results are nan for a state that does not converge.
-        """
-        if q.ndim == 1:
-            q, qd = self._corrected(q[None], qd[None], t, values)
-            return q[0], qd[0]
-        ends = np.full((2, *q.shape), np.nan)
-        remaining = np.arange(len(q))  # states that have not converged
-        t, *each = (np.broadcast_to(x, len(q)) for x in (t, *values))
-        for _ in range(12):
-            dq, dqd = self._correction(q, qd, t, tuple(each))
-            q, qd = q + dq, qd + dqd
-            size = np.abs(q) + 1e-3 * np.max(np.abs(q), axis=-1, keepdims=True)
-            # the square of such a correction is rounding only
-            small = np.all(np.abs(dq) <= 1e-8 * size, axis=-1)
-            ends[:, remaining[small]] = q[small], qd[small]
-            going_on = ~small & np.all(np.isfinite(q), axis=-1)
-            if not np.any(going_on):
-                break
-            remaining, q, qd, t, *each = (x[going_on] for x in (remaining, q, qd, t, *each))
-        return ends[0], ends[1]
-
-    def _correction(self, q: Vector, qd: Vector, t: Vector, values: Values) -> Vector:
-        """Return one Newton correction of q and of q̇, (2, b, nq)."""
-        rest = np.zeros_like(q)
-        D, A, off = (self._constraint_values(name, q, qd, t, values) for name in ROWS)
-        dq, _ = kkt.solve(D, A, rest, -self._holonomic * off)
-        far = np.max(np.abs(dq), axis=-1, keepdims=True)
-        part = np.minimum(1 / 16, DIFFERENCE_STEP / np.maximum(far, DIFFERENCE_STEP))
-        slope = np.zeros_like(off)
-        for k, weight in STENCIL:
-            ends = [
-                self._constraint_values(RATES, q + x * dq, qd, t, values)
-                for x in (-k * part, k * part)
-            ]
-            slope += weight / part * (ends[1] - ends[0])
-        moved = self._constraint_values(RATES, q, qd, t, values) + slope
-        dqd, _ = kkt.solve(D, A, rest, -moved)
-        return np.stack([dq, dqd])
-
-    def mass_and_force(
-        self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
-    ) -> tuple[Vector, Vector]:
-        """Return D (nq, nq) and the force τ - bias (nq,), with the arguments of `value`."""
-        D, bias, tau = (self.value(name, q, qd, t, u, values) for name in ("D", "bias", "tau"))
-        return D, tau - bias
-
-    def _step(
-        self, q: Vector, qd: Vector, h: float, t: Any, u: ArrayLike | None, values: Values
-    ) -> tuple[Vector, Vector]:
-        v1, a1 = qd, self._acceleration(q, qd, t, u, values)
-        v2 = qd + h / 2 * a1
-        a2 = self._acceleration(q + h / 2 * v1, v2, t + h / 2, u, values)
-        v3 = qd + h / 2 * a2
-        a3 = self._acceleration(q + h / 2 * v2, v3, t + h / 2, u, values)
-        v4 = qd + h * a3
-        a4 = self._acceleration(q + h * v3, v4, t + h, u, values)
-        q = q + h / 6 * (v1 + 2 * v2 + 2 * v3 + v4)
-        qd = qd + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
-        return self._corrected(q, qd, np.add(t, h), values) if self.system.constraints else (q, qd)
+def _by_states(t: ArrayLike, params: Params, count: int) -> tuple[Vector, dict[str, Vector]]:
+    """Return the time and the parameters as arrays with an entry for each of the states."""
+    each = {name: np.broadcast_to(x, count) for name, x in (params or {}).items()}
+    return np.broadcast_to(t, count), each
 
 
 def by_rows(x: ArrayLike, rows: int) -> list[Any]:
@@ -440,13 +403,6 @@ class DiscreteReference(ReferenceModel):
         elif name in ("D", "C"):
             value = self._with_discrete_block(value, float(name == "D"))
         return value[()]
-
-    def mass_and_force(
-        self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
-    ) -> tuple[Vector, Vector]:
-        """Return D and τ - bias; see `ReferenceModel.mass_and_force`."""
-        D, force = self.core.mass_and_force(*self._core_arguments(q, qd, t, u, values))
-        return self._with_discrete_block(D, 1.0), self._with_discrete_columns(force)
 
     def _core_arguments(
         self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from sympy import Symbol
 
-from eomc.model.loops import find_wrong_rotations
+from eomc.model.constraints import find_wrong_rotations
 from eomc.verify import kkt
 from eomc.verify.reference import ReferenceModel, Vector
 
@@ -46,8 +46,6 @@ class SampleBudget:
         Number of steps of the run that estimates the range of the motion.
     stride : int
         Length of each of these steps, as a multiple of the scene's step size h.
-    few : int
-        Number of states from which single steps start.
     run : int
         Number of steps of a run that is compared.
     """
@@ -55,13 +53,12 @@ class SampleBudget:
     states: int
     prediction_steps: int
     stride: int
-    few: int
     run: int
 
 
-SMALL = SampleBudget(states=16, prediction_steps=50, stride=1, few=4, run=100)
+SMALL = SampleBudget(states=16, prediction_steps=50, stride=1, run=100)
 # for a reference that takes a tenth of a second per evaluation
-LARGE = SampleBudget(states=6, prediction_steps=5, stride=10, few=4, run=4)
+LARGE = SampleBudget(states=6, prediction_steps=5, stride=10, run=4)
 
 # names of values: that of the module's function, and that of the reference
 VALUES = {
@@ -225,16 +222,16 @@ class Sampler:
         # range of the motion: half a turn for angles; for others, from the first steps, else 1 m
         slides, turns = set[Symbol](), set[Symbol]()
         for link in system.tree.links if system.tree else ():
-            (turns if link.turns else slides).update(link.q.free_symbols)
+            (slides if link.angular == 0 else turns).update(link.q.free_symbols)
         slides -= turns
         self.angles = np.array([c.unit == "rad" and c.q not in slides for c in system.coordinates])
         self.discrete = [k for k, c in enumerate(system.coordinates) if c.name in system.discrete]
-        far, fast = self._predicted_ranges(effort)
+        far, fast = self.predicted_ranges(effort)
         self.spread = np.where(self.angles, np.pi, np.where(far > NOISE, far, 1.0))
         self.speed = np.maximum(fast, 10 * self.spread / system.run.duration)
         self.scale = np.array([self.spread, self.speed])
 
-    def _predicted_ranges(self, effort: SampleBudget) -> Vector:
+    def predicted_ranges(self, effort: SampleBudget) -> Vector:
         """Return how far coordinates and velocities get, (2, nq); 0 where that is not finite.
 
         Steps are halved until that makes no difference: the scene's h may be too long for its
@@ -403,16 +400,6 @@ class Sampler:
             return []
         return self._find_wrong_rotations(s.q.tolist(), s.t, s.params or {})
 
-    def rows(self, name: str, s: State) -> Vector:
-        """Return residuals, rates or Jacobian of the independent constraint equations at a state.
-
-        name: "constraints" or "constraint_rates", (r,), or "constraint_jacobian", (r, nq). The r
-        equations are those that remain if redundant ones are left out; some may be sums of the
-        system's equations.
-        """
-        values = self.reference.evaluate(name, s.q, s.qd, s.t, s.u, s.params)
-        return np.asarray(self.reference.solved @ values)
-
     def regular(self, s: State) -> bool:
         """Return whether the reference's D is finite and far from singular at a state.
 
@@ -422,7 +409,7 @@ class Sampler:
         """
         D = self.reference.evaluate("D", s.q, s.qd, s.t, s.u, s.params)
         if self.system.constraints:
-            A = self.rows("constraint_jacobian", s)
+            A = self.reference.solved_values("constraint_jacobian", s.q, s.qd, s.t, s.params)
             off = self.reference.switched & ~np.any(A, axis=1)
             weighted = bool(self.system.closure and self.system.closure.weights)
             return kkt.is_regular(D, A[~off], 1e-6) and kkt.is_nonnegative(
@@ -460,7 +447,9 @@ class Sampler:
             return None
         diagonal = np.sqrt(np.diag(reach["D"]))
         if self.system.constraints:  # a coordinate without inertia gets one from its constraints
-            scale = kkt.scales(D, self.rows("constraint_jacobian", s))[: len(qd)]
+            scale = kkt.scales(
+                D, self.reference.solved_values("constraint_jacobian", s.q, s.qd, s.t, s.params)
+            )[: len(qd)]
             diagonal = np.where(diagonal > 0, diagonal, 1 / scale)
         inertia = np.outer(diagonal, diagonal) + reach["D"]
         rate = np.max(qd / self.spread)  # at which D changes, 1/s
@@ -536,16 +525,6 @@ class Sampler:
         digits[:, 1::2] *= -1
         near = [x + k * digits for k in (-2, 1, 3)] if self.system.constraints else []
         return np.stack([x, *others, *near], axis=1)
-
-    def energy(self, s: State) -> tuple[Vector, Vector]:
-        """Return the reference's energy K + P at a state, J, and the size that defines a rounding.
-
-        An error of eps times the size is one unit of rounding.
-        """
-        names = ("kinetic", "potential")
-        K, P = (self.value_and_size(partial(self.reference.evaluate, name), s)[1] for name in names)
-        size = np.maximum(K + P, self.reference.terms("energy", vars(s)))
-        return self.reference.evaluate("energy", s.q, s.qd, s.t, s.u, s.params), size
 
     def value_and_size(self, function: Callable[..., Any], s: State) -> tuple[Vector, Vector]:
         """Return the value f of a function at a state, and the size that its errors refer to.

@@ -1,32 +1,24 @@
-"""Independent reference for large systems, by numerical Taylor arithmetic along the definitions.
+"""Independent reference for large systems, by automatic differentiation with dual numbers.
 
-No formula is expanded or differentiated. The value of each expression and those of its derivatives
-that are needed are arrays of numbers. Rules for sums, products and functions compute those of a
-result from those of its arguments, from the coordinates to K, P, R and Q, along the definitions in
-their order (Griewank & Walther, *Evaluating Derivatives*, 2nd ed., ch. 13). The reference starts
-from the `System` and has nothing else in common with the compiler, which differentiates formulas
-backwards.
+No formula is expanded or differentiated. A dual number is a value x with a tangent x', the
+derivative of x by something; the rules of differentiation are its arithmetic (Griewank & Walther,
+*Evaluating Derivatives*, 2nd ed., ch. 13). Value and tangent are arrays with a row for each state,
+or dual numbers again, which gives higher derivatives. Formulas are evaluated along the definitions,
+in their order, from coordinates that are dual numbers. The reference starts from the `System` and
+has nothing else in common with the compiler, which differentiates formulas backwards.
 
-Let e be an expression, x = (q, t), v = qd, and d = (qd, 1) the time derivative of x. At qdd = 0 the
-following derivatives are sufficient. Those by x have nq + 1 entries, those by v have nq.
+The equations of motion are those of Lagrange in Nielsen's form, with T = K - a·q̇ (a·q̇ is the linear
+potential):
 
-    s    e_x . d        time derivative          x    e_x            gradient by q and t
-    xs   e_xx d         rate of e_x              v    e_v            gradient by v
-    vs   e_vx d         rate of e_v              vv   e_vv           (nq, nq)
-    vvs  rate of e_vv   (nq, nq)                 N    e_vq - e_vq^T  (nq, nq)
-
-xs is needed for expressions of positions only. For e = dot(y), the value is y_s, and s = y_xs . d,
-x = y_xs, v = y_q. vs is the rate of y_q, which is y_xs without its last entry. vv, vvs and N are
-zero, N since y_qq is symmetric. Therefore neither a full matrix of second derivatives nor a third
-derivative is needed.
+    bias = ∂(dT/dt)/∂q̇ - 2 ∂T/∂q + ∂P/∂q,  dT/dt at q̈ = 0
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial, reduce
 from typing import Any
 
 import numpy as np
@@ -34,147 +26,282 @@ import sympy
 from numpy.typing import ArrayLike
 from sympy import Expr
 
-from eomc.base.errors import EomcError
+from eomc.model.algebra import CLASSES, compile_function
+from eomc.model.symbols import needed_definitions
 from eomc.model.system import System, dot, t
+from eomc.runtime.mathematics import ANALYTIC, MathFunction, numpy_functions
+from eomc.scene import formulas
 from eomc.verify.reference import SCALARS, ReferenceModel, Values, Vector
 
 BLOCK = 2**16  # entries of the (nq, nq) matrices of all states evaluated at once, for the cache
 
-Jet = dict[str, Any]  # value and derivatives by name, a row for each state; without zeros
-Fields = frozenset[str]
 
-PAIRS = ("vv", "vvs", "N")  # derivatives that are (nq, nq) matrices
-_VELOCITY_FIELDS = {"v", "vs", *PAIRS}
+# --- dual numbers ---------------------------------------------------------------------------------
 
-# for each value of `evaluate`, the derivatives that it requires: of K, of T = K - a.qd (a.qd is the
-# linear potential), P, R, the forces Q, and so on
-_REQUIRED_FIELDS: Mapping[str, Mapping[str, str]] = {
-    "D": {"T": "vv"},
-    "C": {"T": "vvs N"},
-    "g": {"T": "vs x", "P": "x"},
-    "bias": {"T": "vs x", "P": "x"},
-    "tau": {"Q": "value", "R": "v", "y": "x", "F": "value"},
-    "kinetic": {"K": "value"},
-    "potential": {"P": "value"},
-    "energy": {"K": "value", "P": "value"},
-    "jacobi": {"T": "value v", "P": "value"},
-    "power": {"T": "x", "P": "x", "Q": "value", "R": "v", "y": "x", "F": "value"},
-    "signals": {"u": "value"},
-    "motion": {"T": "vs x vv", "P": "x", "Q": "value", "R": "v", "y": "x", "F": "value"},
-    "constraints": {"phi": "value", "psi": "value"},
-    "constraint_jacobian": {"phi": "x", "psi": "v"},
-    "constraint_rates": {"phi": "s", "psi": "value"},
-    "gamma": {"phi": "xs", "psi": "s"},
+
+@dataclass(frozen=True, slots=True)
+class Dual:
+    """A value and its tangent, a derivative; None stands for a tangent of zero.
+
+    Both are numbers, arrays or dual numbers. Other numbers and arrays are constants. In one
+    calculation, all dual numbers are nested equally deep, so that each level has one meaning.
+    """
+
+    value: Any
+    tangent: Any = None
+    __array_ufunc__ = None  # NumPy leaves products of arrays and dual numbers to this class
+
+    def __add__(self, other: Any) -> Any:
+        if isinstance(other, Dual):
+            return Dual(self.value + other.value, _plus(self.tangent, other.tangent))
+        return Dual(self.value + other, self.tangent)
+
+    def __mul__(self, other: Any) -> Any:
+        if isinstance(other, Dual):
+            tangent = _plus(_times(self.value, other.tangent), _times(other.value, self.tangent))
+            return Dual(self.value * other.value, tangent)
+        return Dual(self.value * other, _times(other, self.tangent))
+
+    def __matmul__(self, other: Any) -> Any:
+        if isinstance(other, Dual):
+            tangent = None if other.tangent is None else self.value @ other.tangent
+            if self.tangent is not None:
+                tangent = _plus(tangent, self.tangent @ other.value)
+            return Dual(self.value @ other.value, tangent)
+        return Dual(self.value @ other, None if self.tangent is None else self.tangent @ other)
+
+    def __rmatmul__(self, other: Any) -> Any:
+        return Dual(other @ self.value, None if self.tangent is None else other @ self.tangent)
+
+    @property
+    def T(self) -> Dual:
+        """The transpose."""
+        return Dual(self.value.T, None if self.tangent is None else self.tangent.T)
+
+    __radd__, __rmul__ = __add__, __mul__
+
+    def __neg__(self) -> Dual:
+        return Dual(-self.value, _times(-1.0, self.tangent))
+
+    def __sub__(self, other: Any) -> Any:
+        return self + (-other)
+
+    def __rsub__(self, other: Any) -> Any:
+        return other + (-self)
+
+    def __truediv__(self, other: Any) -> Any:
+        return self * (1 / other)
+
+    def __rtruediv__(self, other: Any) -> Any:
+        inverse = 1 / self.value
+        return Dual(other * inverse, _times(-other * inverse * inverse, self.tangent))
+
+    def __pow__(self, exponent: Any) -> Any:
+        if isinstance(exponent, Dual):
+            return exponent.raise_base(self)
+        if self.tangent is None:
+            return Dual(self.value**exponent)
+        # x^0 has the slope 0 at x = 0, too
+        less = exponent - 1 if np.all(exponent) else np.where(exponent == 0, 0.0, exponent - 1)
+        return Dual(self.value**exponent, exponent * self.value**less * self.tangent)
+
+    def __rpow__(self, base: Any) -> Any:
+        return self.raise_base(Dual(base))
+
+    def raise_base(self, base: Dual) -> Dual:
+        """Return base^x, as exp(x log base)."""
+        x, y = base.value, self.value
+        slope = _times(FUNCTIONS["log"](x), self.tangent)
+        return Dual(power := x**y, _times(power, _plus(slope, _times(y / x, base.tangent))))
+
+
+def _plus(a: Any, b: Any) -> Any:
+    return b if a is None else a if b is None else a + b
+
+
+def _times(a: Any, b: Any) -> Any:
+    return None if b is None else a * b
+
+
+def differentiable(evaluate: Callable[..., Any], slopes: Sequence[Callable[..., Any]]) -> Any:
+    """Return a function of numbers, arrays and dual numbers.
+
+    evaluate: the function of numbers and arrays. slopes: its derivatives with respect to each
+    argument, as functions of the same arguments.
+    """
+
+    def apply(*args: Any) -> Any:
+        if not any(isinstance(x, Dual) for x in args):
+            return evaluate(*args)
+        base = [x.value if isinstance(x, Dual) else x for x in args]
+        tangents = [
+            slope(*base) * x.tangent
+            for x, slope in zip(args, slopes, strict=False)
+            if isinstance(x, Dual) and x.tangent is not None
+        ]
+        return Dual(apply(*base), reduce(_plus, tangents, None))
+
+    return apply
+
+
+def _slopes(f: MathFunction) -> list[Callable[..., Any]]:
+    """Return the derivatives of a function, from the formulas in its row of the table."""
+
+    def slope(text: str) -> Callable[..., Any]:
+        formula = formulas.parse(text)
+
+        def evaluate(*args: Any) -> Any:
+            known = dict(zip(f.arguments, args, strict=True))
+            return formulas.evaluate(formula, ALGEBRA, known.__getitem__)
+
+        return evaluate
+
+    return [slope(text) for text in f.derivatives]
+
+
+def _corner(x: Any, *_: Any) -> Any:
+    """Return nan at 0, where the derivative does not exist, and 0 elsewhere."""
+    while isinstance(x, Dual):
+        x = x.value
+    return np.where(np.asarray(x) == 0, math.nan, 0.0)
+
+
+def time_derivative(x: Any, levels: int = 1) -> Any:
+    """Return dx/dt, if the outermost levels of dual numbers are derivatives by time."""
+    if not isinstance(x, Dual) or x.tangent is None:
+        return 0.0
+    return Dual(x.tangent, time_derivative(x.tangent, levels - 1) if levels > 1 else None)
+
+
+_ARRAYS = numpy_functions()
+_STEP = differentiable(np.heaviside, [_corner])
+_SIGN = differentiable(np.sign, [_corner])
+
+
+def _extreme(name: str) -> Callable[..., Any]:
+    """Return min or max; where two arguments are equal, the derivative is the mean of theirs."""
+
+    def share(x: Any, y: Any) -> Any:
+        return _STEP(x - y if name == "max" else y - x, 0.5)
+
+    slopes = [share, lambda x, y: share(y, x)]
+    two = differentiable(_ARRAYS[name], slopes)
+    return lambda *args: reduce(two, args)
+
+
+FUNCTIONS: Mapping[str, Callable[..., Any]] = {
+    **{f.name: differentiable(_ARRAYS[f.name], _slopes(f)) for f in ANALYTIC},
+    "abs": differentiable(np.abs, [_SIGN]),
+    "sign": _SIGN,
+    "heaviside": _STEP,
+    "min": _extreme("min"),
+    "max": _extreme("max"),
+}
+ALGEBRA: Mapping[str, Any] = {"number": float, "pi": math.pi, **FUNCTIONS}
+# by the names of SymPy; it prints sign(x) as a comparison, unless it is a function unknown to SymPy
+_JUMP = sympy.Function("jump")
+COMPILED = {
+    **{CLASSES[name].__name__: f for name, f in FUNCTIONS.items() if name in CLASSES},
+    "sqrt": FUNCTIONS["sqrt"],
+    "jump": _SIGN,
+    "dot": time_derivative,
 }
 
 
-# for each derivative of a product, or of dot(e), the derivatives of its arguments that it requires
-FEEDS: Mapping[str, Mapping[str, str]] = {
-    "product": {
-        "value": "value",
-        "s": "value s",
-        "x": "value x",
-        "v": "value v",
-        "xs": "value s x xs",
-        "vs": "value s v vs",
-        "vv": "value v vv",
-        "vvs": "value s v vs vv vvs",
-        "N": "value x v N",
-    },
-    "dot": {"value": "s", "s": "xs", "x": "xs", "v": "x", "vs": "xs"},
-}
+def compile_formulas(
+    arguments: Sequence[Any],
+    expressions: Sequence[Any],
+    definitions: Sequence[tuple[Any, Expr]],
+    levels: int = 1,
+) -> Callable[..., list[Any]]:
+    """Return a function that evaluates expressions with numbers, arrays or dual numbers.
+
+    levels: number of levels of derivatives by time, of which dot(...) takes one.
+    """
+
+    def printable(e: Any) -> Expr:
+        return sympy.sympify(e).replace(sympy.sign, _JUMP)
+
+    known = [(name, printable(e)) for name, e in needed_definitions(definitions, expressions)]
+    functions = {**COMPILED, "dot": partial(time_derivative, levels=levels)}
+    return compile_function(arguments, [*map(printable, expressions)], [functions], known)
+
+
+def nested_rates(expressions: Iterable[Expr], definitions: Iterable[tuple[Expr, Expr]]) -> int:
+    """Return how many time derivatives dot(...) are nested in expressions and definitions."""
+    known: dict[Expr, int] = {}
+
+    def find(e: Expr) -> int:
+        if e not in known:
+            known[e] = max(map(find, e.args), default=0) + isinstance(e, dot)
+        return known[e]
+
+    for name, body in definitions:
+        known[name] = find(body)
+    return max(map(find, expressions), default=0)
+
+
+# --- the reference --------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Op:
-    """One operation: a rule that is applied to the results of earlier operations.
+class StateVariables:
+    """Coordinates, velocities and the time at b states, as arrays (b, 1) or as dual numbers."""
 
-    Attributes
-    ----------
-    kind : str
-        Its rule, a key of RULES.
-    args : tuple of int
-        Indices of the operations whose results are its arguments.
-    data : object
-        A number, index or function that the rule needs.
-    degree : float
-        Degree in the velocities; inf if it is not a polynomial in them.
-    moves : int
-        2 if it depends on q, 1 if it depends on t only, else 0.
-    rate, has_inputs : bool
-        Whether it depends on a time derivative dot(...), and on an input.
-    """
-
-    kind: str
-    args: tuple[int, ...] = ()
-    data: Any = None
-    degree: float = 0
-    moves: int = 0
-    rate: bool = False
-    has_inputs: bool = False
-
-
-@dataclass(frozen=True)
-class EvaluationPoint:
-    """The b states at which operations are evaluated.
-
-    q, qd: coordinates and velocities, (b, nq). t: time, s. u: inputs. values: parameters. The time
-    and each input and parameter are one number or a column (b, 1).
-    """
-
-    q: Vector
-    qd: Vector
+    q: Sequence[Any]
+    qd: Sequence[Any]
     t: Any
-    u: Any
-    values: Any
 
-    @cached_property
-    def d(self) -> Vector:
-        """Time derivative (q̇, 1) of x = (q, t), (b, nq + 1)."""
-        return np.concatenate([self.qd, np.ones((len(self.qd), 1))], axis=1)
+    def with_tangents(
+        self, q: Iterable[Any] | None = None, qd: Iterable[Any] | None = None, t: Any = None
+    ) -> StateVariables:
+        """Return the variables with a level of tangents: those of q, qd and t; None for zero."""
+        return StateVariables(
+            [*map(Dual, self.q, q)] if q is not None else [*map(Dual, self.q)],
+            [*map(Dual, self.qd, qd)] if qd is not None else [*map(Dual, self.qd)],
+            Dual(self.t, t),
+        )
 
-    def unit(self, i: int, more: int) -> Vector:
-        """Return the unit vector along entry i, as a matrix with one row, (1, nq + more).
+    @property
+    def in_time(self) -> StateVariables:
+        """The variables with their derivatives by time at q̈ = 0 as tangents."""
+        return self.with_tangents(q=self.qd, t=1.0)
 
-        more: number of entries after the nq coordinates, such as 1 for the time.
-        """
-        row = np.zeros((1, self.q.shape[1] + more))
-        row[0, i] = 1
-        return row
+
+def part_of(x: Any, *levels: str) -> Any:
+    """Return a part of a dual number: "value" or "tangent" of each level, the outermost first."""
+    for level in levels:
+        x = getattr(x, level) if isinstance(x, Dual) else x if level == "value" else None
+    return 0.0 if x is None else x
 
 
 class TaylorReference(ReferenceModel):
-    """Reference that evaluates equations of motion with arrays of derivatives instead of formulas.
+    """Reference that evaluates equations of motion with dual numbers instead of formulas.
 
     A reference is the independent evaluation of a system in Python, with which modules are
     compared. The quantities have the same meaning as in `symbolic.derive`.
 
-    With the notation of the module's docstring, D = T_vv, bias = T_vs - T_q + P_q, and C = (c(qd) +
-    c(0))/2 with c = T_vvs + N. This is the sum of Christoffel's 1/2 (Ddot + dp2_i/dq_j -
-    dp2_j/dq_i) for p2 = D qd, the gyroscopic part da_i/dq_j - da_j/dq_i and the explicit dD/dt.
-    There are no difference quotients: each value is exact up to a few roundings of its largest
-    terms.
-
-    Raises EomcError if K is not recognised as a polynomial of degree 2 in the velocities, or if a
-    required derivative is not known.
+    D is ∂²T/∂q̇². With J = ∂bias/∂q̇, C = (J(q̇) + J(0))/2: this is the sum of Christoffel's terms,
+    the gyroscopic terms and the explicit ∂D/∂t. There are no difference quotients: each value is
+    exact up to a few roundings of its largest terms.
     """
 
     def __init__(self, system: System) -> None:
-        self.system = system
-        self._list = operations = _List(system)
-        degree = operations.ops[operations.roots["T"][0]].degree
-        if degree > 2:
-            raise EomcError(
-                "the kinetic energy is not quadratic in the velocities, or can't be seen to be: "
-                "write it as a sum of products. Friction belongs in 'dissipation' or [forces]"
-            )
-        rates = (c for c in system.constraints if not c.holonomic)
-        for c, index in zip(rates, operations.roots["psi"], strict=True):
-            if operations.ops[index].degree > 1:
-                raise EomcError(
-                    f"{system.name}: the constraint {c.name} is not linear in the rates"
-                )
-        self._plans: dict[str, tuple[tuple[int, Op, Fields], ...]] = {}
+        self.system = s = system
+        holonomic = [c.formula for c in s.constraints if c.holonomic]
+        self.formulas: dict[str, list[Expr]] = {
+            "K": [s.kinetic],
+            "T": [s.kinetic - s.linear_potential],
+            "P": [s.potential],
+            "R": [s.dissipation],
+            "Q": [*(s.forces or (sympy.S.Zero,) * len(s.q))],
+            "u": [i.signal for i in s.inputs],
+            "y": [y for y, _ in s.applied],
+            "F": [force for _, force in s.applied],
+            "phi": holonomic,
+            "psi": [c.formula for c in s.constraints if not c.holonomic],
+        }
+        self._functions: dict[str, tuple[Callable[..., Any], bool]] = {}
 
     def value(
         self, name: str, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
@@ -199,515 +326,160 @@ class TaylorReference(ReferenceModel):
             u = np.zeros((1, len(self.system.inputs)))
         elif u is None:
             u = self._rows("signals", q, qd, t, None, values)
-        if name == "C":  # with and without velocities
-            q, qd = np.concatenate([q, q]), np.concatenate([qd, 0 * qd])
-            t, u, *values = map(_twice, (t, u, *values))
-        if name == "g":
-            qd = np.zeros_like(qd)
-        inputs, parameters = ([_column(z) for z in zs] for zs in (u.T, values))
+        axes = 2 if name in ("D", "C") else 1  # beside the one of the states
+
+        def column(z: Any) -> Any:
+            return np.asarray(z, float).reshape(-1, *[1] * axes) if np.ndim(z) else np.float64(z)
+
+        at = StateVariables([*map(column, q.T)], [*map(column, qd.T)], column(t))
+        constants = [column(z) for z in (*u.T, *values)]
         with np.errstate(all="ignore"):
-            result = self._outputs(name, EvaluationPoint(q, qd, _column(t), inputs, parameters))
+            result = np.array(_Evaluation(self, at, constants, len(q)).value(name))
         result[~np.isfinite(result.reshape(len(result), -1)).all(axis=1)] = math.nan
-        return result
+        return result[:, 0] if name in SCALARS else result
 
-    def mass_and_force(
-        self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
-    ) -> tuple[Vector, Vector]:
-        """Return D and τ - bias from one evaluation."""
-        both = self.value("motion", q, qd, t, u, values)  # (..., nq, nq + 1)
-        return both[..., :-1], both[..., -1]
+    def evaluate_formulas(
+        self, root: str, x: StateVariables, constants: Sequence[Any]
+    ) -> list[Any]:
+        """Return the values of the formulas of `root`, such as "K", at some states.
 
-    def _outputs(self, name: str, state: EvaluationPoint) -> Vector:
-        """Return the values of `name`, one row for each state."""
-        jets = self._run(name, state)
-        roots, (b, nq) = self._list.roots, state.q.shape
+        constants: values of the inputs and of the parameters.
+        """
+        if root not in self._functions:
+            s, exprs = self.system, [*map(sympy.sympify, self.formulas[root])]
+            symbols = (*s.q, *s.qd, t, *s.u, *(p.symbol for p in s.parameters))
+            has_rates = nested_rates(exprs, s.definitions) > 0
+            function = compile_formulas(symbols, exprs, s.definitions)
+            self._functions[root] = function, has_rates
+        function, has_rates = self._functions[root]
+        x = x.in_time if has_rates else x
+        values = function(*x.q, *x.qd, x.t, *constants)
+        return [part_of(y, "value") for y in values] if has_rates else values
 
-        def part(root: str, field: str, *shape: int) -> Vector:
-            (index,) = roots[root]
-            return np.broadcast_to(jets.get(index, {}).get(field, 0.0), (b, *shape))
 
-        def each(root: str) -> Vector:
-            result = [np.broadcast_to(jets[index]["value"], (b, 1)) for index in roots[root]]
-            return np.concatenate([np.zeros((b, 0)), *result], axis=1)
+@dataclass(frozen=True)
+class _Evaluation:
+    """Evaluation of quantities at b states; the results have a row for each state.
 
-        def tau() -> Vector:
-            result = each("Q") - part("R", "v", nq)
-            for y, force in zip(roots["y"], roots["F"], strict=True):
-                result = result + jets[force]["value"] * jets[y]["x"][:, :nq]
-            return result
+    at: the states; each number has one axis more, or two for D and C, along which gradients lie.
+    constants: values of the inputs and of the parameters.
+    """
 
-        def bias() -> Vector:
-            slope = part("P", "x", nq + 1) - part("T", "x", nq + 1)
-            return part("T", "vs", nq) + slope[:, :nq]
+    reference: TaylorReference
+    at: StateVariables
+    constants: Sequence[Any]
+    b: int
 
+    def value(self, name: str) -> Vector:
+        """Return the value of a quantity, such as "D" or "power"."""
         match name:
             case "D":
-                result = part("T", "vv", nq, nq)
+                return self.mass_matrix()
             case "C":
-                c = part("T", "vvs", nq, nq) + part("T", "N", nq, nq)
-                result = (c[: b // 2] + c[b // 2 :]) / 2
-            case "bias" | "g":
-                result = bias()
-            case "motion":
-                D, b = part("T", "vv", nq, nq), tau() - bias()
-                result = np.concatenate([D, b[..., None]], axis=2)
+                slopes = (
+                    self.inertial_forces(at, "tangent") for at in (self.at, self.state_at_rest)
+                )
+                return np.swapaxes(sum(slopes), 1, 2) / 2
+            case "bias":
+                return self.inertial_forces(self.at) + self.gradient("P", q=self.units)
+            case "g":
+                return self.inertial_forces(self.state_at_rest) + self.gradient("P", q=self.units)
             case "tau":
-                result = tau()
+                return self.forces()
             case "kinetic":
-                result = part("K", "value", 1)
+                return self.columns("K")
             case "potential":
-                result = part("P", "value", 1)
+                return self.columns("P")
             case "energy":
-                result = part("K", "value", 1) + part("P", "value", 1)
+                return self.columns("K") + self.columns("P")
             case "jacobi":
-                twice = np.sum(part("T", "v", nq) * state.qd, axis=1, keepdims=True)
-                result = twice - part("T", "value", 1) + part("P", "value", 1)
+                momenta = self.gradient("T", qd=self.units)
+                return self.power(momenta) - self.columns("T") + self.columns("P")
             case "power":
-                work = np.sum(tau() * state.qd, axis=1, keepdims=True)
-                explicit = part("T", "x", nq + 1) - part("P", "x", nq + 1)
-                result = work - explicit[:, nq:]
-            case "constraints" | "constraint_jacobian" | "constraint_rates" | "gamma":
-                result = self._rows_of(name, jets, state)
-            case _:
-                result = each("u")
-        return np.array(result[:, 0] if name in SCALARS else result)
+                T, P = (self.gradient(name, 1, t=1.0) for name in "TP")
+                return self.power(self.forces()) - T + P
+            case "signals":
+                return self.columns("u")
+        return self.constraints(name)
 
-    def _rows_of(self, name: str, jets: Mapping[int, Jet], state: EvaluationPoint) -> Vector:
-        """Return values of the constraints: (b, m), or (b, m, nq) for the Jacobian A."""
-        b, nq = state.q.shape
+    @property
+    def state_at_rest(self) -> StateVariables:
+        """The states with velocities of zero."""
+        return StateVariables(self.at.q, [0 * v for v in self.at.qd], self.at.t)
 
-        def part(index: int, field: str, *shape: int) -> Vector:
-            return np.broadcast_to(jets.get(index, {}).get(field, 0.0), (b, *shape))
+    @property
+    def units(self) -> Vector:
+        """Unit vectors (nq, 1, nq) along the last axis."""
+        return np.eye(len(self.at.q))[:, None, :]
 
-        phi, psi = self._list.roots["phi"], self._list.roots["psi"]
-        match name:
-            case "constraints":
-                result = [part(k, "value", 1) for k in (*phi, *psi)]
-            case "constraint_jacobian":
-                result = [part(k, "x", nq + 1)[:, None, :nq] for k in phi]
-                result += [part(k, "v", nq)[:, None] for k in psi]
-            case "constraint_rates":
-                result = [part(k, "s", 1) for k in phi] + [part(k, "value", 1) for k in psi]
-            case _:
-                bends = (np.sum(part(k, "xs", nq + 1) * state.d, axis=1) for k in phi)
-                result = [bend[:, None] for bend in bends] + [part(k, "s", 1) for k in psi]
-        return np.concatenate(result, axis=1)
+    def formulas(self, name: str, at: StateVariables) -> list[Any]:
+        """Return the values of some formulas, such as "Q"."""
+        return self.reference.evaluate_formulas(name, at, self.constants)
 
-    def _run(self, name: str, state: EvaluationPoint) -> dict[int, Jet]:
-        if name not in self._plans:
-            self._plans[name] = tuple(self._list.plan(_REQUIRED_FIELDS[name]))
-        jets: dict[int, Jet] = {}
-        for index, op, want in self._plans[name]:
-            jets[index] = RULES[op.kind](op, [jets.get(arg, {}) for arg in op.args], want, state)
-        return jets
+    def array(self, x: Any, *shape: int, levels: Sequence[str] = ()) -> Vector:
+        """Return a part of a dual number as an array (b, *shape)."""
+        return np.broadcast_to(part_of(x, *levels), (self.b, *shape))
 
+    def columns(self, name: str) -> Vector:
+        """Return the values of formulas, (b, k)."""
+        columns = [self.array(x, 1) for x in self.formulas(name, self.at)]
+        return np.concatenate([np.zeros((self.b, 0)), *columns], axis=1)
 
-def _twice(z: Any) -> Any:
-    """Return the rows repeated once; a number, or a single row, is unchanged."""
-    return np.concatenate([z, z]) if np.ndim(z) and len(z) > 1 else z
+    def gradient(self, name: str, size: int = 0, **by: Any) -> Vector:
+        """Return the derivatives of a scalar, (b, size); by default nq of them."""
+        (x,) = self.formulas(name, self.at.with_tangents(**by))
+        return self.array(x, size or len(self.at.q), levels=["tangent"])
 
+    def power(self, forces: Vector) -> Vector:
+        """Return the power (b, 1) of forces (b, nq)."""
+        qd = np.concatenate(self.at.qd, axis=1)
+        return np.asarray(np.sum(forces * qd, axis=1, keepdims=True))
 
-def _column(z: Any) -> Any:
-    """Return a number unchanged, and one number for each state as a column."""
-    return np.asarray(z, float)[:, None] if np.ndim(z) else np.float64(z)
+    def forces(self) -> Vector:
+        """Return τ = Q - ∂R/∂q̇ + Σ F ∂y/∂q, (b, nq)."""
+        forces = self.columns("Q") - self.gradient("R", qd=self.units)
+        lengths = self.formulas("y", self.at.with_tangents(q=self.units))
+        for y, force in zip(lengths, self.formulas("F", self.at), strict=True):
+            forces = forces + force * self.array(y, len(self.at.q), levels=["tangent"])
+        return forces
 
+    def inertial_forces(self, at: StateVariables, *further: str) -> Vector:
+        """Return f = ∂(dT/dt)/∂q̇ - 2 ∂T/∂q, (b, nq); or ∂f_j/∂q̇_i, (b, nq, nq).
 
-# --- from expressions to a flat list of operations ------------------------------------------------
-
-
-@dataclass
-class _List:
-    """List of the distinct operations in all expressions of a system, in order of evaluation.
-
-    ops: the operations. known: index of the operation that evaluates an expression. roots: indices
-    of the results, such as "K" or "Q", by name.
-    """
-
-    system: System
-    ops: list[Op] = field(default_factory=list)
-    known: dict[Expr, int] = field(default_factory=dict)
-    roots: dict[str, list[int]] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        s = self.system
-        for i, (q, qd) in enumerate(zip(s.q, s.qd, strict=True)):
-            self.known[q] = self.add(Op("q", data=i, moves=2))
-            self.known[qd] = self.add(Op("qd", data=i, degree=1))
-        self.known[t] = self.add(Op("t", moves=1))
-        for i, u in enumerate(s.u):
-            self.known[u] = self.add(Op("u", data=i, has_inputs=True))
-        for i, p in enumerate(s.parameters):
-            self.known[p.symbol] = self.add(Op("parameter", data=i))
-        for name, body in s.definitions:
-            self.known[name] = self.node(body)
-        forces = s.forces or (sympy.S.Zero,) * len(s.q)
-        roots = {"K": [s.kinetic], "T": [s.kinetic - s.linear_potential], "P": [s.potential]}
-        roots |= {"R": [s.dissipation], "Q": [*forces]}
-        roots |= {"u": [i.signal for i in s.inputs]}
-        roots |= {"y": [y for y, _ in s.applied], "F": [force for _, force in s.applied]}
-        roots |= {"phi": [c.formula for c in s.constraints if c.holonomic]}
-        roots |= {"psi": [c.formula for c in s.constraints if not c.holonomic]}
-        self.roots = {name: [self.node(e) for e in exprs] for name, exprs in roots.items()}
-
-    def add(self, op: Op) -> int:
-        """Append an operation and return its index."""
-        self.ops.append(op)
-        return len(self.ops) - 1
-
-    def make(self, kind: str, args: Iterable[int], data: Any = None, degree: float = 0) -> int:
-        """Append an operation on the results of earlier ones and return its index.
-
-        kind, data, degree: as in `Op`. args: indices of its arguments. The operation depends on q,
-        time, rates and inputs if an argument does.
+        further: "tangent" for the derivatives, which need states with two more axes.
         """
-        args = tuple(args)
-        of = [self.ops[i] for i in args]
-        moves, rate, constant = (
-            max(getattr(a, n) for a in of) for n in ("moves", "rate", "has_inputs")
+        n, ones = len(at.q), [1] * len(further)
+        units = np.eye(2 * n).reshape(2 * n, 1, *ones, 2 * n)
+        x = at.with_tangents(q=units[:n], qd=units[n:])
+        if further:
+            x = x.with_tangents(qd=np.eye(n)[:, None, :, None])
+        (T,) = self.formulas("T", x.in_time)
+        rate, slope = (
+            self.array(T, *[n] * len(further), 2 * n, levels=[part, *further, "tangent"])
+            for part in ("tangent", "value")
         )
-        return self.add(Op(kind, args, data, degree, moves, rate or kind == "dot", constant))
+        return np.asarray(rate[..., n:] - 2 * slope[..., :n])
 
-    def node(self, e: Any) -> int:
-        """Return the index of the operation that evaluates the expression `e`.
+    def mass_matrix(self) -> Vector:
+        """Return D, (b, nq, nq); states have two more axes."""
+        units = np.eye(n := len(self.at.q))
+        x = self.at.with_tangents(qd=units[:, None, None, :])
+        (T,) = self.formulas("T", x.with_tangents(qd=units[:, None, :, None]))
+        return self.array(T, n, n, levels=["tangent", "tangent"])
 
-        The operations are appended if `e` is new.
-        """
-        e = sympy.sympify(e)
-        if e not in self.known:
-            self.known[e] = self.build(e)
-        return self.known[e]
-
-    def build(self, e: Expr) -> int:
-        """Append the operations that evaluate `e`, and return the index of the last one.
-
-        Raises EomcError if the derivatives of `e` are not known.
-        """
-        if e.is_number:
-            return self.add(Op("number", data=np.float64(e)))
-        if isinstance(e, dot):
-            return self.rate(e)
-        if e.is_Add:
-            terms = [a.as_coeff_Mul() for a in e.args]
-            weights = tuple(float(weight) for weight, _ in terms)
-            args = [self.node(a) for _, a in terms]
-            return self.make("sum", args, weights, max(self.ops[a].degree for a in args))
-        if e.is_Mul or (e.is_Pow and e.exp == 2):
-            return self.product(e)
-        args = [self.node(a) for a in e.args]
-        degree = math.inf if any(self.ops[a].degree for a in args) else 0
-        if e.is_Pow:
-            return self.make("power", args, degree=degree)
-        if isinstance(e, sympy.atan2):
-            return self.make("atan2", args, degree=degree)
-        if isinstance(e, sympy.Min | sympy.Max):
-            index = args[0]
-            for other in args[1:]:
-                index = self.make("extreme", (index, other), e.func is sympy.Max, degree)
-            return index
-        if isinstance(e, sympy.Heaviside):
-            return self.make("function", args[:1], step_at(float(e.args[1])), degree)
-        if e.func in FUNCTIONS and len(args) == 1:
-            return self.make("function", args, FUNCTIONS[e.func], degree)
-        raise EomcError(f"{self.system.name}: the derivatives of {e} are not known")
-
-    def product(self, e: Expr) -> int:
-        """Append the operations for a product or square, and return the index of the last one.
-
-        Factors are sorted by what they depend on, so that few products have large derivatives.
-        """
-        factors: list[int] = []
-        for factor in e.args if e.is_Mul else (e,):
-            square = factor.is_Pow and factor.exp == 2
-            factors += [self.node(factor.base)] * 2 if square else [self.node(factor)]
-        factors.sort(key=lambda i: (self.ops[i].degree > 0, self.ops[i].moves, i))
-        index = factors[0]
-        for other in factors[1:]:
-            degree = self.ops[index].degree + self.ops[other].degree
-            index = self.make("product", (index, other), degree=degree)
-        return index
-
-    def rate(self, e: Expr) -> int:
-        """Append the operation for a dot(...), a derivative by time, and return its index.
-
-        Raises EomcError if the expression in it depends on velocities, inputs or another dot(...).
-        """
-        inside = self.node(e.args[0])
-        op = self.ops[inside]
-        if op.degree or op.has_inputs or op.rate:
-            what = "velocities" if op.degree else "inputs" if op.has_inputs else "a dot(...)"
-            raise EomcError(f"{e} hangs on {what}, whose rates are not known")
-        return self.make("dot", (inside,), degree=1 if op.moves == 2 else 0)
-
-    def plan(self, fields_by_root: Mapping[str, str]) -> Iterator[tuple[int, Op, Fields]]:
-        """Return the operations that some derivatives require, in the order of their evaluation.
-
-        fields_by_root: for each root, the name of a quantity such as "K", the names of its required
-        derivatives, separated by spaces. Each entry of the result is the index of an operation, the
-        operation, and the derivatives that must be computed for it.
-        """
-        need: dict[int, set[str]] = {}
-        for root, fields in fields_by_root.items():
-            for index in self.roots[root]:
-                self._demand(need, index, fields.split())
-        for index in range(len(self.ops) - 1, -1, -1):
-            op = self.ops[index]
-            for field_ in sorted(need.get(index, ())):
-                if op.kind == "sum":
-                    feeds = [field_]
-                else:
-                    feeds = FEEDS["dot" if op.kind == "dot" else "product"].get(field_, "").split()
-                for arg in op.args:
-                    self._demand(need, arg, feeds)
-        return ((i, op, frozenset(need[i])) for i, op in enumerate(self.ops) if need.get(i))
-
-    def _demand(self, need: dict[int, set[str]], index: int, fields: Iterable[str]) -> None:
-        """Record that `fields` are needed, except those that are zero."""
-        op, here = self.ops[index], need.setdefault(index, set())
-        for name in fields:
-            if name in _VELOCITY_FIELDS:
-                if op.degree > 0:
-                    here.add(name)
-            elif name == "value" or op.moves or op.degree:
-                here.add(name)
-
-
-# --- rules: value and derivatives of an operation from those of its arguments ---------------------
-
-
-def _weighted(*terms: tuple[Any, Any]) -> Any:
-    """Return the sum of w z over pairs (w, z); None counts as zero."""
-    total = None
-    for w, z in terms:
-        if w is None or z is None:
-            continue
-        part = (w[..., None] if z.ndim == 3 and isinstance(w, np.ndarray) else w) * z
-        total = part if total is None else total + part
-    return total
-
-
-def _plus(total: Any, part: Any) -> Any:
-    return part if total is None else total if part is None else total + part
-
-
-def _outer(a: Any, b: Any) -> Any:
-    return None if a is None or b is None else a[:, :, None] * b[:, None, :]
-
-
-def _with_transpose(a: Any, sign: int = 1) -> Any:
-    return None if a is None else a + a.swapaxes(1, 2) if sign > 0 else a - a.swapaxes(1, 2)
-
-
-def _without_none(jet: Jet) -> Jet:
-    return {name: part for name, part in jet.items() if part is not None}
-
-
-def _leaf(op: Op, args: list[Jet], fields: Fields, at: EvaluationPoint) -> Jet:
-    match op.kind:
-        case "number":
-            return {"value": op.data}
-        case "parameter":
-            return {"value": at.values[op.data]}
-        case "u":
-            return {"value": at.u[op.data]}
-        case "t":
-            return {"value": at.t, "s": np.ones((1, 1)), "x": at.unit(-1, 1)}
-        case "q":
-            i = op.data
-            return {"value": at.q[:, i, None], "s": at.qd[:, i, None], "x": at.unit(i, 1)}
-    return {"value": at.qd[:, op.data, None], "v": at.unit(op.data, 0)}
-
-
-def _sum(op: Op, args: list[Jet], fields: Fields, at: EvaluationPoint) -> Jet:
-    out: Jet = {}
-    for name in fields:
-        total, mine = None, False
-        for weight, a in zip(op.data, args, strict=True):
-            if name in a:
-                part = a[name] if weight == 1 else weight * a[name]
-                if total is None:
-                    total = part
-                elif name in PAIRS and mine and total.shape == part.shape:
-                    total += part
-                else:
-                    total, mine = total + part, True
-        if total is not None:
-            out[name] = total
-    return out
-
-
-def _product(op: Op, args: list[Jet], fields: Fields, at: EvaluationPoint) -> Jet:
-    return _times(args[0], args[1], fields)
-
-
-def _times(a: Jet, b: Jet, fields: Fields) -> Jet:
-    """Return the derivatives of a product (Leibniz's rule)."""
-    x, y, g, h = a["value"], b["value"], a.get, b.get
-    if len(a) == 1:  # a number, or a function of parameters only
-        large = x[..., None] if isinstance(x, np.ndarray) else x
-        return {n: (large if n in PAIRS else x) * z for n, z in b.items() if n in fields}
-    out: Jet = {}
-    for name in fields:
-        if name == "value":
-            out[name] = x * y
-            continue
-        terms = [(x, h(name)), (y, g(name))]
-        if name in ("xs", "vs"):
-            terms += [(g("s"), h(name[0])), (h("s"), g(name[0]))]
-        elif name == "vvs":
-            terms += [(g("s"), h("vv")), (h("s"), g("vv"))]
-        total = _weighted(*terms)
-        if name == "vv":
-            total = _plus(total, _with_transpose(_outer(g("v"), h("v"))))
-        elif name == "vvs":
-            mixed = _plus(_outer(g("v"), h("vs")), _outer(g("vs"), h("v")))
-            total = _plus(total, _with_transpose(mixed))
-        elif name == "N":
-            mixed = _plus(
-                _outer(g("v"), _without_time(h("x"))), _outer(h("v"), _without_time(g("x")))
-            )
-            total = _plus(total, _with_transpose(mixed, -1))
-        out[name] = total
-    return _without_none(out)
-
-
-def _without_time(x: Any) -> Any:
-    """Return a row without its entry for t."""
-    return None if x is None else x[:, :-1]
-
-
-def _chain(f: tuple[Any, Any, Any], a: Jet, fields: Fields) -> Jet:
-    """Return the value and derivatives of f(a) by the chain rule, from f, f' and f'' at a."""
-    value, slope, bend = f
-    g = a.get
-    out: Jet = {}
-    for name in fields:
-        if name == "value":
-            out[name] = value
-        elif name in ("s", "x", "v"):
-            out[name] = _weighted((slope, g(name)))
-        elif name in ("xs", "vs"):
-            turn = None if g("s") is None else bend * g("s")
-            out[name] = _weighted((slope, g(name)), (turn, g(name[0])))
-        else:  # for K only, which is a polynomial in the velocities
-            raise AssertionError(name)
-    return _without_none(out)
-
-
-def _function(op: Op, args: list[Jet], fields: Fields, at: EvaluationPoint) -> Jet:
-    return _chain(op.data(args[0]["value"]), args[0], fields)
-
-
-def _power(op: Op, args: list[Jet], fields: Fields, at: EvaluationPoint) -> Jet:
-    """Return a^b, as exp(b log a) if b is not constant."""
-    a, b = args
-    x, y = np.asarray(a["value"]), b["value"]
-    value = x**y
-    if len(b) == 1:
-        slope = _falling(y, x, y - 1)
-        return _chain((value, slope, _falling(y * (y - 1), x, y - 2)), a, fields)
-    inside = frozenset(f for name in fields for f in FEEDS["product"][name].split())
-    exponent = _times(b, _chain(FUNCTIONS[sympy.log](x), a, inside), inside)
-    return _chain((value, value, value), exponent, fields)
-
-
-def _falling(factor: Any, x: Any, y: Any) -> Any:
-    """Return factor x^y, or 0 where the factor is 0."""
-    return np.where(np.asarray(factor) == 0, 0.0, factor * x**y)
-
-
-def _atan2(op: Op, args: list[Jet], fields: Fields, at: EvaluationPoint) -> Jet:
-    """Return the angle of (x, y), by atan in a frame rotated so that y is 0 at this point."""
-    inside = frozenset(f for name in fields for f in FEEDS["product"][name].split())
-    y, x = args
-    r = np.hypot(x["value"], y["value"])
-    c, s = x["value"] / r, y["value"] / r
-    across, along = (
-        _without_none({n: _weighted((i, y.get(n)), (j, x.get(n))) for n in inside - {"value"}})
-        for i, j in ((c, -s), (s, c))
-    )
-    slope = _chain((1 / r, -1 / r**2, 2 / r**3), along | {"value": r}, inside)
-    angle = _times(across | {"value": 0 * r}, slope, inside)  # atan' = 1 and atan'' = 0 at 0
-    return {n: z for n, z in angle.items() if n in fields} | {
-        "value": np.arctan2(y["value"], x["value"])
-    }
-
-
-def _extreme(op: Op, args: list[Jet], fields: Fields, at: EvaluationPoint) -> Jet:
-    """Return the larger or smaller of two; their mean where they are equal."""
-    a, b = args
-    larger, x, y = op.data, np.asarray(a["value"]), b["value"]
-    first = np.heaviside(x - y if larger else y - x, 0.5)
-    corner = _corner(x - y)
-    out: Jet = {"value": np.maximum(x, y) if larger else np.minimum(x, y)}
-    for name in fields - {"value"}:
-        out[name] = _weighted((first, a.get(name)), (1 - first, b.get(name)))
-        if name in ("xs", "vs") and out[name] is not None:
-            out[name] = out[name] + corner
-    return _without_none(out)
-
-
-def _rate(op: Op, args: list[Jet], fields: Fields, at: EvaluationPoint) -> Jet:
-    """Return d/dt, from the derivatives along d = (qd, 1)."""
-    (e,) = args
-    xs = e.get("xs")
-    out: Jet = {
-        "value": e.get("s", 0.0),
-        "x": xs,
-        "v": _without_time(e.get("x")),
-        "vs": _without_time(xs),
-    }
-    if "s" in fields and xs is not None:
-        out["s"] = np.sum(xs * at.d, axis=1, keepdims=True)
-    return {name: part for name, part in out.items() if name in fields and part is not None}
-
-
-RULES: Mapping[str, Callable[[Op, list[Jet], Fields, EvaluationPoint], Jet]] = {
-    **dict.fromkeys(("number", "parameter", "u", "t", "q", "qd"), _leaf),
-    "sum": _sum,
-    "product": _product,
-    "function": _function,
-    "power": _power,
-    "atan2": _atan2,
-    "extreme": _extreme,
-    "dot": _rate,
-}
-
-
-# --- functions: value, first and second derivative ------------------------------------------------
-
-Three = tuple[Any, Any, Any]
-
-
-def _corner(x: Any) -> Any:
-    """Return nan at 0, where the derivative does not exist."""
-    return np.where(np.asarray(x) == 0, math.nan, 0.0)
-
-
-def _asin(x: Any) -> Three:
-    slope = 1 / np.sqrt((1 - x) * (1 + x))
-    return np.arcsin(x), slope, x * slope**3
-
-
-def step_at(at_zero: float) -> Callable[[Any], Three]:
-    """Return a function of x that computes the step function and its first two derivatives.
-
-    at_zero: value of the step function at x = 0, where the derivatives are nan.
-    """
-    return lambda x: (np.heaviside(x, at_zero), _corner(x), _corner(x))
-
-
-FUNCTIONS: Mapping[Any, Callable[[Any], Three]] = {
-    sympy.sin: lambda x: (f := np.sin(x), np.cos(x), -f),
-    sympy.cos: lambda x: (f := np.cos(x), -np.sin(x), -f),
-    sympy.tan: lambda x: (f := np.tan(x), g := 1 + f**2, 2 * f * g),
-    sympy.asin: _asin,
-    sympy.acos: lambda x: (np.arccos(x), *(-g for g in _asin(x)[1:])),
-    sympy.atan: lambda x: (np.arctan(x), g := 1 / (1 + x**2), -2 * x * g**2),
-    sympy.sinh: lambda x: (f := np.sinh(x), np.cosh(x), f),
-    sympy.cosh: lambda x: (f := np.cosh(x), np.sinh(x), f),
-    sympy.tanh: lambda x: (f := np.tanh(x), g := 1 / np.cosh(x) ** 2, -2 * f * g),
-    sympy.exp: lambda x: (f := np.exp(x), f, f),
-    sympy.log: lambda x: (np.log(x), 1 / x, -1 / x**2),
-    sympy.Abs: lambda x: (np.abs(x), np.sign(x), _corner(x)),
-    sympy.sign: lambda x: (np.sign(x), _corner(x), _corner(x)),
-}
+    def constraints(self, name: str) -> Vector:
+        """Return values of the constraints: (b, m), or (b, m, nq) for the Jacobian A."""
+        at, rates = self.at, self.at.in_time
+        by_q, by_qd = at.with_tangents(q=self.units), at.with_tangents(qd=self.units)
+        positions, velocities, size = {
+            "constraints": ((at, 0), (at, 0), 1),
+            "constraint_jacobian": ((by_q, 1), (by_qd, 1), len(at.q)),
+            "constraint_rates": ((rates, 1), (at, 0), 1),
+            "gamma": ((rates.in_time, 2), (rates, 1), 1),
+        }[name]
+        rows = [
+            self.array(row, size, levels=["tangent"] * order)
+            for name, (x, order) in (("phi", positions), ("psi", velocities))
+            for row in self.formulas(name, x)
+        ]
+        return np.stack(rows, axis=1) if positions[0] is by_q else np.concatenate(rows, axis=1)

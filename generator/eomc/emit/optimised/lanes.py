@@ -6,27 +6,26 @@ the constraints included. The lane determines types, arguments and the represent
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 from sympy import Expr, S
 
-from eomc.emit import c_function as c
-from eomc.emit import projection
-from eomc.emit.c_expression import FOUR, Block, CBody, Printer, Real
-from eomc.emit.c_function import CArgument, CFunction, GeneratedFunction
-from eomc.emit.c_names import Target, cost_sentence, rename_reserved
-from eomc.emit.functions import RATE_TERMS, SceneFunctions
-from eomc.emit.optimised.accelerations import Accelerations
-from eomc.emit.projection import ProjectionView
-from eomc.program import outline
-from eomc.program.ir import Call, Function, Sum
+from eomc.emit.common import c_function as c
+from eomc.emit.common import projection
+from eomc.emit.common.amalgamate import amalgamate
+from eomc.emit.common.c_expression import DOUBLE, FOUR, MIN_SIMD_ANGLES, Block, CBody, Printer, Real
+from eomc.emit.common.c_function import CArgument, CFunction, GeneratedFunction
+from eomc.emit.common.c_names import Target, cost_sentence, rename_reserved
+from eomc.emit.common.functions import CORRECTION, RATE_TERMS, SceneFunctions
+from eomc.emit.common.solver import SolverModel, library_names, state_arguments
+from eomc.program import outline, two_point
+from eomc.program.ir import Call, Function, Operand, Sum, rename
 from eomc.program.program import TIME
 from eomc.program.two_point import Angle
 
-INLINE, NOINLINE = "INLINE", "NOINLINE"
+MAX_INLINED_OPERATIONS = 300  # of accelerations, up to which every stage inlines them
 
 
 def padded_size(n: int) -> int:
@@ -41,6 +40,146 @@ def interleaved_index(k: int) -> int:
     it stores the coordinates or angles in the order 0, 2, 1, 3.
     """
     return k - k % FOUR + (0, 2, 1, 3)[k % FOUR]
+
+
+def _forward(function: CFunction, library: str, *passed: str) -> str:
+    """Return the definition of a function that calls a function of the library."""
+    call = f"{library}({', '.join(passed)})"
+    reads = frozenset(a.name for a in function.arguments)
+    body = (Block("", (c.return_statement(call),)),)
+    return replace(function, body=body, reads=reads).definition
+
+
+@dataclass(frozen=True)
+class Accelerations:
+    """The accelerations q̈ of a scene, split into functions for the methods of optimised C.
+
+    Attributes
+    ----------
+    target
+        The program and its C names.
+    constants
+        Names of precomputed expressions, which depend on the parameters only.
+    angles
+        Angles whose sines and cosines are arguments of the remaining function.
+    parts
+        The remaining function, split into a position-dependent and a velocity-dependent part; None
+        where this split is not faster.
+    """
+
+    target: Target
+
+    @cached_property
+    def function(self) -> Function:
+        """The function of the program for the accelerations, before it is split."""
+        return self.target.program["acceleration"]
+
+    @cached_property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the scene's parameters."""
+        return tuple(p.name for p in self.target.system.parameters)
+
+    @cached_property
+    def precomputed_and_remaining(self) -> tuple[Function, Function]:
+        """The accelerations as two functions of the program.
+
+        The first computes all expressions that depend on the parameters only, once for a run; the
+        second computes the accelerations from these, at every stage.
+        """
+        precomputed, remaining = outline.split_precomputed(self.function, self.parameter_names)
+        projections = [self._split_projection[0]] if self._split_projection else []
+        names = [o.name for f in (precomputed, *projections) for o in f.outputs]
+        others = ("signal", "rate_terms")  # other functions of steps that read parameters
+        read_by_others = {n for name in others if (f := self.target.program.functions.get(name))
+                for n in f.uses}  # fmt: skip
+        results = [n for n in self.parameter_names if n in names or n in read_by_others]
+        results += [n for n in names if n not in self.parameter_names]
+        return replace(
+            precomputed,
+            early=tuple(a for f in (precomputed, *projections) for a in f.early),
+            outputs=tuple(Operand(S.One, n) for n in results),
+            checks=tuple(pair for f in (precomputed, *projections) for pair in f.checks),
+        ), remaining
+
+    @cached_property
+    def _split_projection(self) -> tuple[Function, Function] | None:
+        """The projection, split in the same way."""
+        whole = self.target.program.functions.get("projection")
+        if whole is None:
+            return None
+        precomputed, remaining = outline.split_precomputed(whole, self.parameter_names)
+        new_names = {a.name: f"rows_{a.name}" for a in precomputed.early}
+        return rename(precomputed, new_names), rename(remaining, new_names)
+
+    @cached_property
+    def correction(self) -> tuple[Function, bool]:
+        """The function for corrections of a state onto the constraints, and a flag.
+
+        The function reads precomputed expressions of the parameters. If the flag is True, it also
+        takes the sines and cosines that the accelerations take; if False, it computes its own.
+        """
+        assert self._split_projection is not None
+        remaining = self._split_projection[1]
+        angles, separated = two_point.separate_angles(remaining, self.target.names)
+        known = {(frozenset(a.terms), a.offset): a for a in self.angles}
+        pairs = [(a, known.get((frozenset(a.terms), a.offset))) for a in angles]
+        names = {
+            old: new for a, b in pairs if b for old, new in ((a.sine, b.sine), (a.cosine, b.cosine))
+        }
+        computed = {a.name for a in separated.body}
+        if not angles or not all(b for _, b in pairs) or computed & {*names.values()}:
+            return remaining, False
+        return rename(separated, names), True
+
+    @property
+    def constants(self) -> tuple[str, ...]:
+        """Names of the precomputed expressions, which depend on the parameters only."""
+        return tuple(o.name for o in self.precomputed_and_remaining[0].outputs)
+
+    @cached_property
+    def angles_and_function(self) -> tuple[tuple[Angle, ...], Function]:
+        """The angles in the accelerations, and the function for the accelerations without sines.
+
+        The function takes the sines and cosines of the angles as arguments, so that a step can
+        obtain them by rotating those of another stage. There are no angles if eomc has no sine and
+        cosine of its own for the type of numbers.
+        """
+        if not self.target.real.reach:
+            return (), self.precomputed_and_remaining[1]
+        return two_point.separate_angles(self.precomputed_and_remaining[1], self.target.names)
+
+    @property
+    def angles(self) -> tuple[Angle, ...]:
+        """Angles whose sines and cosines are arguments of the function for the accelerations."""
+        return self.angles_and_function[0]
+
+    @cached_property
+    def parts(self) -> two_point.Parts | None:
+        """The accelerations, split into a position-dependent and a velocity-dependent function.
+
+        None if the scene does not use RK4 in double precision, or if the split is not faster.
+        """
+        target = self.target
+        if target.real is not DOUBLE or "rk4" not in target.system.run.methods:
+            return None
+        early = {a.name for a in self.function.early}
+        return two_point.split(
+            self.angles_and_function[1], self.angles, target.system, {*self.parameter_names, *early}
+        )
+
+    @property
+    def simd_angles(self) -> bool:
+        """Whether single trajectories compute the sines of four angles in one vector register."""
+        constrained = bool(self.target.system.constraints)
+        return self.parts is not None or (constrained and len(self.angles) >= MIN_SIMD_ANGLES)
+
+    @property
+    def is_long(self) -> bool:
+        """Whether the C function for the accelerations is too long to be inlined in every stage.
+
+        Compilation would take too long if it were inlined.
+        """
+        return outline.weight(self.angles_and_function[1]) > MAX_INLINED_OPERATIONS
 
 
 @dataclass(frozen=True)
@@ -137,15 +276,14 @@ class Lane:
         return f"{self.prefix}_constants{self.suffix if self.name != 'two' else ''}"
 
     @property
-    def qualifiers(self) -> Mapping[str, str]:
-        """Names of the C macros that make a function inlined or not, by key INLINE or NOINLINE."""
-        return {kind: f"{self.target.PREFIX}_{kind}" for kind in (INLINE, NOINLINE)}
+    def inline(self) -> str:
+        """The name of the C macro before functions that are inlined."""
+        return f"{self.target.PREFIX}_INLINE"
 
     @property
-    def names(self) -> dict[str, Any]:
-        """The fields of the template data class `LaneFields` for this lane type, by name."""
-        inline = self.qualifiers[INLINE]
-        return {"inline": inline, "lane": self.real.name, "mask": self.mask, "L": self.suffix}
+    def noinline(self) -> str:
+        """The name of the C macro before functions that are not inlined."""
+        return f"{self.target.PREFIX}_NOINLINE"
 
     @property
     def unroll(self) -> str:
@@ -154,7 +292,7 @@ class Lane:
         The loops are not unrolled if vectors of coordinates are padded: compilers then put the
         loops into vector registers.
         """
-        return f"{self.target.PREFIX}_{'ROLLED' if self.padded else 'UNROLL'}"
+        return f"{self.target.PREFIX}_{'ROLLED' if self.two_point else 'UNROLL'}"
 
     @property
     def computes_own_sines(self) -> bool:
@@ -166,13 +304,19 @@ class Lane:
         return not self.name or run.tolerance is not None or {*run.methods} != {"rk4"}
 
     @property
-    def padded(self) -> bool:
-        """Whether C vectors of coordinates are padded with zeros to a multiple of four.
+    def two_point(self) -> bool:
+        """Whether the accelerations are split into two C functions.
 
-        They are padded for plain numbers, if the accelerations are split into a position-dependent
-        and a velocity-dependent function.
+        `configuration` computes the position-dependent part for two configurations q in one vector
+        register. `velocity` computes the accelerations from it, at one of these two.
+        Vectors of coordinates are then padded with zeros to a multiple of four.
         """
         return not self.name and self.accelerations.parts is not None
+
+    @property
+    def count(self) -> str:
+        """The C enumerator for the number of values in a vector register."""
+        return f"{self.target.PREFIX}_{self.name.upper()}_COUNT"
 
     @property
     def simd_angles(self) -> bool:
@@ -187,7 +331,7 @@ class Lane:
         coordinates, and the angles among them, can be read in groups of four.
         """
         n = len(self.target.names)
-        if not self.padded:
+        if not self.two_point:
             return n
         first = self.contiguous_angles or 0
         return max(
@@ -198,7 +342,7 @@ class Lane:
     @property
     def c_width(self) -> str:
         """The number of elements of the C vectors of coordinates (`width`), as a C expression."""
-        return str(self.width) if self.padded else self.NQ
+        return str(self.width) if self.two_point else self.NQ
 
     @cached_property
     def contiguous_angles(self) -> int | None:
@@ -317,7 +461,7 @@ class Lane:
             f"{self.prefix}_{signature.name}{self.suffix}",
             self.mask,
             (*([out] if out else []), *(a for a, _ in supplied_by)),
-            qualifier=self.qualifiers[INLINE if inline else NOINLINE],
+            qualifier=self.inline if inline else self.noinline,
             doc=(doc,) if doc else (),
         )
         if outline.is_large(function):
@@ -372,7 +516,7 @@ class Lane:
                 arguments,
                 self._statements(f, body, [places[n] for n in part.outputs], fails),
                 frozenset(a.name for a in arguments),
-                self.qualifiers[NOINLINE],
+                self.noinline,
                 (f"{name}, {k} of {len(parts)}: {outline.weight(f)} operations.",),
             )
             pieces.append(piece)
@@ -381,7 +525,7 @@ class Lane:
                 if fails
                 else [c.call_statement(piece.call(v="&v"))]
             )
-        if self.padded and out == self.out:
+        if self.two_point and out == self.out:
             calls += [c.assign(f"a[{k}]", self.target.zero) for k in range(len(places), self.width)]
         locals_ = [c.declare(self.mask, f"failed = {self.clear}")]
         locals_ += [c.declare(values, "v")] if shared else []
@@ -407,7 +551,7 @@ class Lane:
         self, function: Function, body: CBody, places: Sequence[str], fails: bool = True
     ) -> tuple[Block, ...]:
         """Return loads, statements and results. Failures are returned if `fails`."""
-        if list(places) == self.places and self.padded:
+        if list(places) == self.places and self.two_point:
             sets = self._stored("a", body.results, self.width)
         else:
             sets = tuple(c.assign(to, x) for to, x in zip(places, body.results, strict=True))
@@ -484,7 +628,22 @@ class Lane:
             "Constants of the parameters.",
         )
 
-    def angles_function(self, what: str, vector: str, offset: bool) -> CFunction:
+    @cached_property
+    def constants_struct(self) -> str:
+        """The C definition of the struct with the precomputed expressions of the parameters."""
+        return c.define_struct(self.constants, self.real.name, self.accelerations.constants)
+
+    @property
+    def angles_at(self) -> CFunction:
+        """The C function for the angles at q."""
+        return self._angles_function("angles_at", "q", offset=True)
+
+    @property
+    def changes(self) -> CFunction:
+        """The C function for the changes of the angles if q changes by d."""
+        return self._angles_function("changes", "d", offset=False)
+
+    def _angles_function(self, what: str, vector: str, offset: bool) -> CFunction:
         """Return the C function for the angles of the accelerations, or for changes of them.
 
         An angle is a linear combination of coordinates plus a constant; the accelerations read its
@@ -496,14 +655,14 @@ class Lane:
         """
         angles = self.accelerations.angles
         values = [self.angle_text(a, vector, a.offset if offset else S.Zero) for a in angles]
-        if self.padded and self.contiguous_angles is not None:
+        if self.two_point and self.contiguous_angles is not None:
             sums = c.copy_loop("x", vector, self.contiguous_angles, self.angle_count)
         else:
             sums = self._stored("x", values, padded_size(len(values)))
         return CFunction(
             f"{self.prefix}_{what}{self.suffix}", "void",
             (c.output_array(self.real.name, "x"), c.input_array(self.real.name, vector)),
-            (Block("", sums),), frozenset({"x", vector}), self.qualifiers[INLINE],
+            (Block("", sums),), frozenset({"x", vector}), self.inline,
         )  # fmt: skip
 
     def angle_text(self, angle: Angle, vector: str, offset: Expr) -> str:
@@ -541,10 +700,16 @@ class Lane:
         """Number of elements of C arrays of angles, as C text.
 
         This is the number of angles. It is rounded up to a multiple of four if the sines of four
-        angles are computed at once.
+        angles are computed at once. "" without angles.
         """
         n = len(self.accelerations.angles)
-        return str(padded_size(n) if self.accelerations.simd_angles and self.name != "wide" else n)
+        return (
+            ""
+            if not n
+            else str(
+                padded_size(n) if self.accelerations.simd_angles and self.name != "wide" else n
+            )
+        )
 
     @cached_property
     def accelerations_function(self) -> CFunction:
@@ -554,13 +719,40 @@ class Lane:
         inputs). If the sines s of the angles are NULL, it computes these too.
         """
         arguments = (self.out, *map(self.argument, self.argument_names))
-        called = self.padded or self.accelerations.is_long
+        called = self.two_point or self.accelerations.is_long
         return CFunction(
             f"{self.prefix}_accelerations{self.suffix}", self.mask, arguments,
-            qualifier=self.qualifiers[NOINLINE if called else INLINE],
+            qualifier=self.noinline if called else self.inline,
         )  # fmt: skip
 
     # two points
+
+    @property
+    def configuration_struct(self) -> str:
+        """The C definition of the struct with the position-dependent part of the accelerations.
+
+        It has values at two configurations q.
+        """
+        parts = self.accelerations.parts
+        assert parts is not None
+        names = f"{self.prefix}_configuration", f"{self.prefix}_two"
+        return c.define_struct(*names, parts.handed)
+
+    @property
+    def both_configurations(self) -> CFunction:
+        """The C function for the position-dependent part at the configurations q1 and q2.
+
+        s1 and s2 are the sines at these.
+        """
+        sines, real = f"{self.prefix}_sines", self.real.name
+        arguments = (
+            c.output_array(f"{self.prefix}_configuration", "k"),
+            *(c.input_array(real, n) for n in ("q1", "q2")),
+            *(c.input_array(sines, n) for n in ("s1", "s2")),
+            *([self.argument("c")] if self.accelerations.constants else []),
+        )
+        name = f"{self.prefix}_both_configurations"
+        return CFunction(name, "int", arguments, qualifier=self.inline)
 
     @cached_property
     def configuration(self) -> GeneratedFunction:
@@ -610,16 +802,8 @@ class Lane:
             f"{self.prefix}_projected{self.suffix}",
             self.mask if self.name else f"{self.prefix}_status",
             (*out, *map(self.argument, self._constraint_arguments()), *singular_flag),
-            qualifier=self.qualifiers[NOINLINE],
+            qualifier=self.noinline,
         )
-
-    def project_end_call(self, **passed: str) -> str:
-        """Return the C call of `project_end`, or "" if the scene has no constraints.
-
-        passed: C expressions for some arguments of the call, by name; the others are passed under
-        their names.
-        """
-        return self.project_end.call(**passed) if "projection" in self.target.program else ""
 
     @cached_property
     def project_stage(self) -> CFunction:
@@ -632,7 +816,7 @@ class Lane:
         others = (n for n in self._constraint_arguments(sines=False) if n in "tc")
         return CFunction(
             f"{self.prefix}_onto", "int", (*state, *map(self.argument, others)),
-            qualifier=self.qualifiers[NOINLINE],
+            qualifier=self.noinline,
         )  # fmt: skip
 
     @cached_property
@@ -642,7 +826,9 @@ class Lane:
         places = [f"d[{k}]" for k in range(len(function.outputs))]
         out, takes = c.output_array(self.real.name, "d"), self._constraint_arguments()
         signature = Signature("projection", out, places, takes)
-        return self.generate_function(function, signature, cost_sentence(function))
+        return self.generate_function(
+            function, signature, f"{CORRECTION} {cost_sentence(function)}"
+        )
 
     @cached_property
     def rate_terms(self) -> GeneratedFunction | None:
@@ -667,29 +853,77 @@ class Lane:
         names = ("q", "qd", *(["s"] if known else []), *(["t"] if timed else []), "c")
         return tuple(n for n in self.argument_names if n in names)
 
-    def projection_view(self, functions: SceneFunctions) -> ProjectionView:
-        """Return the template data of the projection of a step's end onto the constraints.
+    def projection_source(self, functions: SceneFunctions) -> tuple[str, ...]:
+        """Return C definitions of the projection of the end of a step and of its stages.
 
         functions: the scene's C functions that do not depend on the lane.
         """
-        state = {"q": "at", "qd": "moving"}
-        sines = self.accelerations.correction[1]
-        rate_terms = None if self.name else self.rate_terms
-        return ProjectionView(
-            **projection.shared_fields(functions),
-            L=self.suffix,
-            lane=self.real.name,
-            mask=self.mask,
-            extent=self.c_width,
-            increments=True,
-            sines=f"{self.prefix}_sines{self.suffix}" if sines else "",
-            sines_call=f"{self.prefix}_sines_at{self.suffix}(&own, at)"
-            if sines and self.computes_own_sines
-            else "",
-            onto=self.project_stage if functions.iterates_stages and not self.name else None,
-            projection=self.correction,
-            function=self.project_end,
-            call=self.correction.function.call(**state),
-            rate_terms=rate_terms,
-            rate_terms_call=rate_terms.function.call(**state) if rate_terms else "",
+        takes, sines = self._constraint_arguments(), self.accelerations.correction[1]
+        members = (self.argument("c"),) if "c" in takes else ()
+        names = library_names(
+            SolverModel(functions, members, (), self.c_width),
+            EOM_CORRECTION_SIZE=str(projection.correction_size(self.target)),
+            eom_model=self.constants,
+            eom_sines=f"{self.prefix}_sines",
         )
+        rate_terms = self.rate_terms
+        roots = ["eom_project_end", *(["eom_project_stage"] if functions.iterates_stages else [])]
+        features = projection.step_features(functions, increments=True, sines=sines)
+        t = "t" if "t" in takes else "0"
+        end = [*("r", "v", "q", "qd"), *(["s"] if sines else []), t, *("c" if "c" in takes else ())]
+        stage = ["at", "moving", t, *("c" if "c" in takes else ())]
+        wrappers = [_forward(self.project_end, f"{self.prefix}_project_end", *end, "singular")]
+        if functions.iterates_stages:
+            wrappers.append(_forward(self.project_stage, f"{self.prefix}_project_stage", *stage))
+        return (
+            self.correction.text,
+            *([rate_terms.text] if rate_terms else []),
+            *map(names.apply, self._correction_functions(sines)),
+            *amalgamate(("step_projection.c",), roots, names, features),
+            *wrappers,
+        )
+
+    def _correction_functions(self, sines: bool) -> Iterator[str]:
+        """Yield the definitions of the functions that the library's projection calls.
+
+        They have the library's names. sines: whether the correction takes sines and cosines.
+        """
+        s = (c.input_array("eom_sines", "s"),) if sines else ()
+        own = Block("", (c.declare("eom_sines", "own"),))
+        compute = Block("", c.compute_if_null("s", "own", f"{self.prefix}_sines_at(&own, q)"))
+        yield self._library_function(
+            "evaluate_correction", self.correction.function, "d", s, (own, compute) if sines else ()
+        )
+        if self.rate_terms:
+            yield self._library_function("evaluate_rate_terms", self.rate_terms.function, "rates")
+
+    def _library_function(
+        self,
+        name: str,
+        inner: CFunction,
+        out: str,
+        more: tuple[CArgument, ...] = (),
+        blocks: tuple[Block, ...] = (),
+    ) -> str:
+        """Return a function with the library's arguments that calls a function of this lane.
+
+        name: its name after `eom_`. inner: the function of this lane. out: the argument for the
+        result. more: arguments before the time. blocks: statements before the call.
+        """
+        q, qd, t = state_arguments("real")
+        call = inner.call(c="m")
+        last = c.call_statement(call) if inner.result == "void" else c.return_statement(call)
+        reads = {a.name for a in inner.arguments} - {"c"}
+        if any(a.name == "c" for a in inner.arguments) or "c" not in self._constraint_arguments():
+            reads.add("m")
+        return CFunction(
+            f"eom_{name}",
+            inner.result,
+            (
+                *(c.output_array("real", out), q, qd, *more, t),
+                c.input_array("eom_model", "m"),
+            ),
+            (*blocks, Block("", (last,))),
+            frozenset(reads),
+            self.inline,
+        ).definition

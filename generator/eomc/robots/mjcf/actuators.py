@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
-from eomc.robots.limits import input_range, intersection
+import numpy as np
+from numpy.typing import NDArray
+
+from eomc.robots.geometry import IDENTITY_TRANSFORM, ORIGIN, from_quaternion, yaw_pitch_roll
 from eomc.robots.mjcf.file import (
     ACTUATORS,
     MEASURES,
-    AttributeReader,
-    ImportReport,
-    missing_message,
     note_unread_attributes,
 )
-from eomc.robots.mjcf.joints import MjcfJoint, Tendons, is_limited, unique_name
-from eomc.robots.mjcf.masses import IDENTITY_TRANSFORM, Placed, Reader
-from eomc.robots.mjcf.ratios import has_ratio, mass_matrix_at_start, servo_damping
+from eomc.robots.mjcf.joints import (
+    MjcfJoint,
+    Tendons,
+    is_limited,
+    mass_matrix_at_start,
+    unique_name,
+)
+from eomc.robots.mjcf.masses import Placed, Reader
 from eomc.robots.robot import (
     UNLIMITED,
     Drive,
@@ -27,10 +32,12 @@ from eomc.robots.robot import (
     Range,
     RobotBody,
     Tendon,
+    input_range,
+    intersection,
     join_notes,
 )
-from eomc.robots.rotations import ORIGIN, from_quaternion, yaw_pitch_roll
-from eomc.robots.xml import Tag
+from eomc.robots.stiffness import gradient
+from eomc.robots.xml import AttributeReader, ImportReport, Tag
 
 # dyntype: dynamics from the control to the activation, which is the input here
 DYNAMICS = {"none", "integrator", "filter", "filterexact"}
@@ -96,17 +103,15 @@ def _drive(
 ) -> Drive | None:
     """Return the drive of an actuator; add its armature and damping to its joint or tendon."""
     report = reader.report
-    damps, *more = a.numbers("damping", 3, 1) or (0.0,)
-    if any(more):
-        report.leave_out("damping in the square and cube of actuators", name)
+    damps = a.linear_coefficient("damping", "actuators", name)
     gear = (a.numbers("gear", 6, 1) or (1.0,))[0]
     disabled = reader.settings.disabled
     load = gear**2 * a.number("armature"), 0.0 if "damper" in disabled else gear**2 * damps
     off = "actuation" in disabled or a.number("group") in reader.settings.off_groups
-    on = a.get("joint", a.get("jointinparent"))
-    if on:
-        if on not in joints:
-            a.fault(missing_message("joint", on, joints))
+    key = next((key for key in ("joint", "jointinparent", "tendon") if a.get(key)), "")
+    if key.startswith("joint"):
+        on = a.reference(key, "joint", joints)
+        if not on:
             return None
         joint = joints[on]
         if joint.type in {"free", "ball"}:
@@ -114,16 +119,17 @@ def _drive(
             return None
         (motion,) = joint.motions
         joints[on] = replace(joint, motions=(_with_load(motion, *load),))
-    elif tendon := a.get("tendon"):
-        if not tendons.has_tendon(tendon, a):
+    elif key == "tendon":
+        on = a.reference(key, "tendon", tendons.names)
+        if not on:
             return None
-        if tendon not in tendons.fixed:
+        if on not in tendons.fixed:
             report.leave_out("actuators on tendons through space", name)
             return None
-        tendons.fixed[tendon] = _with_load(tendons.fixed[tendon], *load)
-        if off and tendons.fixed[tendon].has_forces:
-            tendons.mark_modelled(tendon)
-        on = tendon if off else tendons.mark_driven(tendon)
+        tendons.fixed[on] = _with_load(tendons.fixed[on], *load)
+        if off and tendons.fixed[on].has_forces:
+            tendons.mark_modelled(on)
+        on = on if off else tendons.mark_driven(on)
     else:
         report.leave_out("actuators on sites, bodies and slider-cranks", name)
         return None
@@ -200,21 +206,52 @@ def _law(a: AttributeReader) -> Law | None:
     )
 
 
+def _has_ratio(law: Law | None) -> bool:
+    """Return True if the control law of an actuator specifies its damping as a damping ratio.
+
+    In MJCF this is a position servo with a positive velocity coefficient.
+    """
+    return bool(law and law.bias[2] > 0 and law.set_point == "kp" and law.kp > 0)
+
+
+def _servo_damping(
+    law: Law, along: Iterable[tuple[float, str]], masses: NDArray[np.float64], rows: Sequence[str]
+) -> float:
+    """Return the damping kv of a servo from its damping ratio: ratio times 2 sqrt(kp m).
+
+    m = 1/(J M^-1 J^T) is the mass that the servo moves, as in MuJoCo 4.
+
+    Parameters
+    ----------
+    law : Law
+        The servo, with the damping ratio as its velocity coefficient.
+    along
+        The gradient J of the servo's length (including its gear), as pairs (entry, coordinate).
+    masses, rows
+        The mass matrix M, and the coordinate of each of its rows.
+    """
+    J = gradient(along, rows)
+    if not np.isfinite(masses).all():  # masses that overflow
+        return 0.0
+    mobility = float(J @ np.linalg.lstsq(masses, J, rcond=None)[0])
+    return 2 * law.bias[2] * math.sqrt(law.kp / mobility) if mobility > 0 else 0.0
+
+
 def _with_damping_ratios(
     actuators: Sequence[Actuator], bodies: Sequence[RobotBody], joints: Sequence[MjcfJoint],
     tendons: Tendons,
 ) -> list[Actuator]:  # fmt: skip
     """Return the actuators with damping ratios converted to damping."""
-    if not any(each.drive and has_ratio(each.drive.law) for each in actuators):
+    if not any(each.drive and _has_ratio(each.drive.law) for each in actuators):
         return list(actuators)
     masses, rows = mass_matrix_at_start(bodies, joints, tendons.fixed.values())
     terms = {t.name: t.terms for t in tendons.fixed.values()}
     out = []
     for each in actuators:
         d = each.drive
-        if d and d.law and has_ratio(d.law):
+        if d and d.law and _has_ratio(d.law):
             along = [(d.gear * by, q) for by, q in terms.get(d.coordinate, ((1.0, d.coordinate),))]
-            kv = servo_damping(d.law, along, masses, rows)
+            kv = _servo_damping(d.law, along, masses, rows)
             law = replace(d.law, bias=(*d.law.bias[:2], -kv))
             note = join_notes(f"a damping ratio of {d.law.bias[2]:g}", d.note)
             each = replace(each, drive=replace(d, law=law, note=note))

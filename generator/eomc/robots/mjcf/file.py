@@ -8,15 +8,21 @@ entities and document types are refused.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from eomc.base.errors import Problem, SceneError
+from eomc.base.errors import SceneError
 from eomc.robots import xml
-from eomc.robots.rotations import Vector
-from eomc.robots.xml import ElementSchema, Tag, parse_format
-from eomc.scene.formulas import suggest
+from eomc.robots.xml import (
+    BOOLEAN,
+    AttributeReader,
+    Attributes,
+    ElementSchema,
+    ImportReport,
+    Tag,
+    parse_format,
+)
 
 # --- elements and attributes ----------------------------------------------------------------------
 
@@ -147,9 +153,7 @@ OPTIONS = SCHEMA.children["option"].attributes
 FLAGS = SCHEMA.children["option"].children["flag"].attributes
 
 
-# --- values of attributes, and the report ---------------------------------------------------------
-
-SHOWN = 12  # names in one note on parts that are left out
+# --- attributes that are not read ---------------------------------------------------------
 
 # arrays of which an element may set the first entries and inherit the others from its class
 PARTIAL = {"size", "gear", "stiffness", "damping", "gainprm", "biasprm", "dynprm"}
@@ -175,133 +179,7 @@ NEUTRAL = {"false", "auto"}  # and zero
 
 ONE_FILE = "let MuJoCo write the model as one file (MjSpec.to_xml)"  # a remedy
 
-BOOLEAN = ("false", "true")
-
-Attributes = dict[str, str]
 Classes = dict[str, dict[str, Attributes]]
-
-
-@dataclass
-class ImportReport:
-    """Errors and notes from reading an MJCF file.
-
-    Attributes
-    ----------
-    faults : list of Problem
-        Errors, all of which are reported together.
-    strangers : tuple of str
-        Notes on elements and attributes that MJCF does not define.
-    left : dict
-        Names of the parts that are not modelled, by kind.
-    """
-
-    faults: list[Problem] = field(default_factory=list)
-    strangers: tuple[str, ...] = ()
-    left: dict[str, list[str]] = field(default_factory=dict)
-
-    def leave_out(self, kind: str, name: str = "") -> None:
-        """Record that a part of the file is left out of the model.
-
-        `kind` describes the kind of part, and `name` is its name, or "" without one.
-        """
-        self.left.setdefault(kind, []).append(name)
-
-    def mark_read(self, kind: str, name: str) -> None:
-        """Remove the record that the part `name` of the given kind is left out of the model."""
-        those = self.left.get(kind, [])
-        if name in those:
-            those.remove(name)
-            if not those:
-                del self.left[kind]
-
-    def notes(self) -> tuple[str, ...]:
-        """Return the notes on what is left out: one for each kind of part, with number and names.
-
-        A name that was recorded twice counts once. Notes on unknown elements come first.
-        """
-        lines = [*self.strangers]
-        for kind, those in self.left.items():
-            names = [*dict.fromkeys(name for name in those if name)]
-            count = those.count("") + len(names)
-            line = f"{kind} ({count})" if count > 1 else kind
-            if named := names[:SHOWN]:
-                more = count - len(named)
-                line += f": {', '.join(named)}" + (f" and {more} more" if more else "")
-            lines.append(line)
-        return tuple(lines)
-
-
-@dataclass(frozen=True)
-class AttributeReader:
-    """Access to the attributes of an element (`tag`) as numbers, words or vectors.
-
-    Attributes may be the element's own or inherited. Faults in them are added to `report`.
-    """
-
-    attributes: Attributes
-    tag: Tag
-    report: ImportReport
-
-    def __contains__(self, key: str) -> bool:
-        return key in self.attributes
-
-    def get(self, key: str, default: str = "") -> str:
-        """Return the text of an attribute, or `default` if it is missing."""
-        return self.attributes.get(key, default)
-
-    def fault(self, message: str) -> None:
-        """Add an error message, with the line of the element, to the report.
-
-        Reading continues, so that all faults are reported together.
-        """
-        tag = self.tag
-        self.report.faults.append(Problem(message, element_label(tag), str(tag.file), tag.line))
-
-    def numbers(self, key: str, most: int, least: int | None = None) -> tuple[float, ...] | None:
-        """Return the numbers in an attribute; None if it is missing or faulty.
-
-        There must be at most `most` and at least `least` numbers (default: `most`).
-        """
-        text = self.attributes.get(key)
-        if text is None:
-            return None
-        least = most if least is None else least
-        try:
-            values = tuple(map(xml.number, text.split()))
-        except ValueError as why:
-            self.fault(f'{key}="{text}": {why}')
-            return None
-        if not least <= len(values) <= most:
-            expected = str(most) if least == most else f"{least} to {most}"
-            self.fault(f'{key}="{text}" has {len(values)} numbers; it takes {expected}')
-            return None
-        return values
-
-    def vector(self, key: str) -> Vector | None:
-        """Return the three numbers of an attribute; None if it is missing or faulty."""
-        values = self.numbers(key, 3)
-        return (values[0], values[1], values[2]) if values else None
-
-    def number(self, key: str, default: float = 0.0) -> float:
-        """Return the number in an attribute, or `default` if it is missing or faulty."""
-        values = self.numbers(key, 1)
-        return values[0] if values else default
-
-    def choice(self, key: str, choices: Sequence[str], default: str = "") -> str:
-        """Return the word in an attribute, which must be one of `choices`.
-
-        It is `default` if the attribute is missing or faulty; the first choice by default.
-        """
-        default = default or choices[0]
-        word = self.get(key, default)
-        if word in choices:
-            return word
-        self.fault(f'{key}="{word}" is not one of {", ".join(choices)}')
-        return default
-
-    def is_true(self, key: str, default: bool = False) -> bool:
-        """Return True if the attribute is "true"; `default` if it is missing or faulty."""
-        return self.choice(key, BOOLEAN, BOOLEAN[default]) == "true"
 
 
 # flags that change the motion, and the effects that they disable
@@ -417,20 +295,6 @@ def _included(
         opened.add(target)
         return xml.root(target).children
     return []
-
-
-def element_label(tag: Tag) -> str:
-    """Return the label of an element in error messages: its kind and its name."""
-    name = tag.get("name")
-    return f'{tag.kind} "{name}"' if name else tag.kind
-
-
-def missing_message(kind: str, name: str, known: Iterable[str]) -> str:
-    """Return the error message that there is no `kind` called `name`.
-
-    The message proposes a similar name among `has_tendon`, if there is one.
-    """
-    return f'there is no {kind} "{name}"{suggest(name, known)}'
 
 
 def note_unread_attributes(a: AttributeReader, kind: str, name: str) -> None:

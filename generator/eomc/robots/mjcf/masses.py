@@ -6,54 +6,35 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
-from eomc.base.spatial import apply, as_inertia, cross, dot, plus, point_inertia, transposed
-from eomc.robots import rotations
-from eomc.robots.inertias import (
+from eomc.base.spatial import as_inertia, cross, dot, plus, point_inertia, transposed
+from eomc.robots import geometry
+from eomc.robots.geometry import (
+    IDENTITY,
     NO_INERTIA,
+    ORIGIN,
     Inertia,
+    Matrix,
+    Transform,
+    Vector,
     indefinite_message,
     principal_moments,
     rotated_inertia,
+    rounded,
+    toward,
     triangle_message,
+    unit,
 )
 from eomc.robots.mjcf.file import (
     ORIENTATION,
-    AttributeReader,
     Classes,
-    ImportReport,
     Settings,
-    missing_message,
     with_defaults,
 )
 from eomc.robots.robot import RobotBody
-from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, times, toward, unit
-from eomc.robots.xml import Tag
+from eomc.robots.xml import AttributeReader, ImportReport, Tag
+from eomc.scene.formulas import suggest
 
 LEAST_MASS = 1e-15  # kg, mjMINVAL of MuJoCo's compiler
-ROUNDING = 1e-15  # relative to neighbouring entries: smaller ones become zero
-
-
-@dataclass(frozen=True)
-class Transform:
-    """The pose of a frame in another frame.
-
-    `place` is its origin (m), and the columns of `turn` are its axes.
-    """
-
-    place: Vector
-    turn: Matrix
-
-    def compose(self, other: Transform) -> Transform:
-        """Return the product of two poses: frame C in frame A, from B in A and C in B.
-
-        This pose is that of B in A, and `other` is that of C in B.
-        """
-        return Transform(
-            plus(self.place, apply(self.turn, other.place)), times(self.turn, other.turn)
-        )
-
-
-IDENTITY_TRANSFORM = Transform(ORIGIN, IDENTITY)
 
 
 @dataclass(frozen=True)
@@ -71,7 +52,7 @@ class Mass:
         """
         return Mass(
             self.mass,
-            plus(pose.place, apply(pose.turn, self.center)),
+            pose.point(self.center),
             rotated_inertia(self.inertia, pose.turn),
         )
 
@@ -133,7 +114,9 @@ class Reader:
         reported for the element `tag`, and the outermost class is returned.
         """
         if name and name not in self.classes:
-            self.own_attributes(tag).fault(missing_message("default class", name, self.classes))
+            self.own_attributes(tag).fault(
+                f'there is no default class "{name}"{suggest(name, self.classes)}'
+            )
             name = ""
         return self.classes[name or "main"]
 
@@ -167,25 +150,25 @@ def _orientation(a: AttributeReader, settings: Settings) -> Matrix:
     if v is None:
         return IDENTITY
     if key == "euler":
-        return rotations.from_euler(settings.eulerseq, [settings.angle(value) for value in v])
+        return geometry.from_euler(settings.eulerseq, [settings.angle(value) for value in v])
     if key == "quat":
         if math.hypot(*v) < 1e-14:
             a.fault("quat has the length zero; no turn is 1 0 0 0")
             return IDENTITY
-        return rotations.from_quaternion(*v)
+        return geometry.from_quaternion(*v)
     first = unit_vector(v[:3], key, a)
     if first is None:
         return IDENTITY
     if key == "zaxis":
         return toward(first)
     if key == "axisangle":
-        return rotations.from_axis_angle(first, settings.angle(v[3]))
+        return geometry.from_axis_angle(first, settings.angle(v[3]))
     along = dot(v[3:], first)
     across = [x - along * y for x, y in zip(v[3:], first, strict=True)]
     second = unit_vector(across, "the y axis of xyaxes", a)
     if second is None:
         return IDENTITY
-    return rotations.cleaned(transposed((first, second, cross(first, second))))
+    return geometry.cleaned(transposed((first, second, cross(first, second))))
 
 
 def read_pose(a: AttributeReader, settings: Settings) -> Transform:
@@ -358,11 +341,6 @@ def _sum(masses: Sequence[Mass]) -> Mass:
         ]
     size = max(map(abs, inertia))
     return Mass(total, (x, y, z), as_inertia(rounded(i, size) for i in inertia))
-
-
-def rounded(x: float, size: float) -> float:
-    """Return x, or 0 if it is a rounding error relative to numbers of magnitude `size`."""
-    return x if abs(x) > ROUNDING * size else 0.0
 
 
 def _inertial(placed: Placed, reader: Reader) -> Mass | None:

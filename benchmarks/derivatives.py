@@ -1,0 +1,149 @@
+"""Time of derivatives of accelerations and of steps, in units of the module's own accelerations.
+
+    python benchmarks/derivatives.py                       # every scene
+    python benchmarks/derivatives.py chain8 ur10 --states 500 2000 --rounds 9
+
+Scenes: points, chains of point masses, whose accelerations take link multipliers; chain, of rods;
+robots. Prints for each scene and number of states a call:
+
+- acc: time of `acceleration` a state, ns;
+- linearize: `linearize`, in accelerations;
+- RK4: `discretize` by RK4, in accelerations and in `linearize`;
+- faults: page faults a state of `linearize`; the allocator then returns memory after each call;
+- error: the largest difference of A and B from differences of the accelerations (of order 8, in
+  doubles, accurate to some 1e-10), relative to the largest entry.
+
+The ratios are those of the shortest of `rounds` calls, which alternate. Robots come from
+example-robot-data (pip install '.[robots]').
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import tempfile
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from robots import CASES, chain, robot
+
+import eomc
+
+
+def point_masses(links: int) -> str:
+    """Return a chain of massless links between point masses, with the angles to the vertical."""
+    numbers = range(1, links + 1)
+    lines = ["eomc = 1", f'name = "points{links}"', "[coordinates]"]
+    lines += [f'q{k} = {{ unit = "rad", start = 0.1 }}' for k in numbers]
+    lines += ["[parameters]", "g = 9.81", *(f"m{k} = 1.0\nl{k} = 1.0" for k in numbers)]
+    lines += ["[definitions]"]
+    for k in numbers:
+        x, y = (f"{name}{k - 1} + " if k > 1 else "" for name in "xy")
+        lines += [f'x{k} = "{x}l{k}*sin(q{k})"', f'y{k} = "{y}-l{k}*cos(q{k})"']
+    kinetic = " + ".join(f"m{k}*(dot(x{k})**2 + dot(y{k})**2)/2" for k in numbers)
+    potential = " + ".join(f"m{k}*g*y{k}" for k in numbers)
+    lines += ["[energy]", f'kinetic = "{kinetic}"', f'potential = "{potential}"']
+    return "\n".join(lines)
+
+
+SCENES: dict[str, Callable[[], str]] = {
+    **{f"points{n}": partial(point_masses, n) for n in (5, 8, 12)},
+    **{f"chain{n}": partial(chain, n) for n in (5, 8, 12)},
+    "ur10": partial(robot, "ur_description/urdf/ur10_robot.urdf"),
+    "panda": partial(robot, "panda_description/urdf/panda.urdf"),  # 8 coordinates: fingers mimic
+    "solo12": CASES["quadruped"].text,
+}
+STENCIL = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))  # central differences of order 8
+
+
+def load(name: str, root: Path) -> Any:
+    """Return the module of a scene with the derivatives."""
+    options, text = "[run]\nlinearize = true\ndiscretize = true\n", SCENES[name]()
+    has_run = "[run]\n" in text
+    text = text.replace("[run]\n", options) if has_run else f"{text}\n{options}"
+    path = root / f"{name}.toml"
+    path.write_text(text, encoding="utf-8")
+    return eomc.load(path, root)
+
+
+def count_faults(call: Callable[[], Any]) -> int:
+    """Return the page faults of one call."""
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    call()
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+
+def shortest(calls: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]:
+    """Return the shortest time of each call, s; the calls alternate."""
+    times = dict.fromkeys(calls, np.inf)
+    for _ in range(rounds + 1):
+        for name, call in calls.items():
+            start = time.perf_counter()
+            call()
+            times[name] = min(times[name], time.perf_counter() - start)
+    return times
+
+
+def difference_error(m: Any, q: Any, qd: Any, u: Any, width: float = 4e-3) -> float:
+    """Return the largest relative difference of A, B from differences of the accelerations."""
+    errors, n = [], m.nq
+    for state in zip(q[:5], qd[:5], u[:5], strict=True):
+        x = np.concatenate(state)
+
+        def qdd(x: Any) -> Any:
+            return m.acceleration(x[:n], x[n : 2 * n], u=x[2 * n :] if m.nu else None)
+
+        A, B = m.linearize(x[:n], x[n : 2 * n], u=x[2 * n :] if m.nu else None)
+        exact = np.hstack([A[n:], B[n:]])
+        near = [
+            sum(w * (qdd(x + k * e) - qdd(x - k * e)) for k, w in STENCIL) / width
+            for e in width * np.eye(len(x))
+        ]
+        errors.append(np.abs(exact - np.transpose(near)).max() / np.abs(exact).max())
+    return float(max(errors))
+
+
+def rows(name: str, m: Any, states: list[int], rounds: int) -> None:
+    """Print the rows of a scene."""
+    random = np.random.default_rng(1)
+    for count in states:
+        q, qd = random.uniform(-1, 1, (2, count, m.nq))
+        u = random.uniform(-1, 1, (count, m.nu))
+        inputs = {"u": u} if m.nu else {}
+        calls: dict[str, Callable[[], Any]] = {
+            "acc": partial(m.acceleration, q, qd, **inputs),
+            "linearize": partial(m.linearize, q, qd, **inputs),
+            "discretize": partial(m.discretize, q, qd, 1e-3, **inputs),
+        }
+        times = shortest(calls, rounds)
+        one, linear = times["acc"], times["linearize"]
+        ratios = {key: f"{t / one:.1f}" for key, t in times.items()}
+        faults = count_faults(calls["linearize"]) / count
+        print(
+            f"| {name} | {count} | {one / count * 1e9:.0f} ns | {ratios['linearize']} "
+            f"| {ratios['discretize']} = "
+            f"{times['discretize'] / linear:.1f} linearize "
+            f"| {faults:.2f} | {difference_error(m, q, qd, u):.0e} |",
+            flush=True,
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("names", nargs="*", help=f"some of {', '.join(SCENES)}; all by default")
+    parser.add_argument("--states", type=int, nargs="+", default=[500, 2000])
+    parser.add_argument("--rounds", type=int, default=9)
+    options = parser.parse_args()
+    print("| scene | states | acc | linearize | RK4 | faults | error |")
+    print("|---|---|---|---|---|---|---|", flush=True)
+    for name in options.names or SCENES:
+        with tempfile.TemporaryDirectory() as folder:
+            rows(name, load(name, Path(folder)), options.states, options.rounds)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""What both forms of C, the FMU and the Python package share."""

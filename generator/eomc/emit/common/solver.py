@@ -1,0 +1,365 @@
+"""The library of numerical methods, csrc/solver, in the C source of a model.
+
+The library calls the model's functions by a struct with the arguments that only the model has, such
+as inputs and parameters. `SolverModel` has these functions; `library_names` the names of the
+library in the model's source; and `tableau_tables` the coefficients of a method.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+from eomc.emit.common import c_function as c
+from eomc.emit.common.amalgamate import Names, amalgamate
+from eomc.emit.common.c_expression import Block
+from eomc.emit.common.c_function import CArgument, CFunction
+from eomc.emit.common.coefficients import c_matrix, c_vector, round_weights
+from eomc.emit.common.functions import SceneFunctions
+from eomc.emit.common.public import program_function
+from eomc.emit.common.templates import show
+from eomc.integrators.tableaux import Method
+
+# Files of csrc/solver with the methods of fixed steps, in the order in which C needs them.
+STEP_FILES = {
+    "explicit": ("state.c", "explicit.c"),
+    "gauss": ("state.c", "linear.c", "differences.c", "step_end.c", "gauss_fixed.c"),
+}
+LIBM = ("atan", "fabs", "floor", "fmax", "sqrt")  # functions of the C mathematics library
+ACCELERATE = "qdd = the accelerations at the state q, qd and time t."
+CALL_STEP = "Advance q and qd by a step of size h of a method for fixed steps."
+CORRECTION = "d = the corrections of q and qd onto the constraints, and the inverse pivots."
+CORRECTION_ALONG = "The correction of the state q, qd, and its derivatives along a direction."
+LINEARIZATION = "The derivatives of the accelerations at the state q, qd and time t."
+RATE_TERMS = "Rates of the equations that a correction may drop, and the sizes of their terms."
+ROTATIONS = (
+    "Rotation errors of loops, squared cosines of half the angles, derivatives of the errors."
+)
+# Functions of the model that evaluate a function of the program: name, name in the program,
+# comment, array for the result, and number of arguments among q and qd.
+EVALUATIONS = (
+    ("event_functions", "events", "g = the event functions at a state.", "g", 2),
+    (
+        "initial_event_functions",
+        "begins",
+        "g > 0: events that trigger at the start of a motion.",
+        "g",
+        2,
+    ),
+    ("jump_maps", "jumps", "after = the states q, qd after the jump of each event.", "after", 2),
+    ("evaluate_metric", "D", "D = the mass matrix, which measures changes of q.", "D", 1),
+    ("evaluate_jacobian", "constraint_jacobian", "A = the constraint Jacobian.", "A", 1),
+    ("evaluate_residuals", "constraints", "Residuals of the constraints.", "residual", 2),
+    ("evaluate_rates", "constraint_rates", "Rates of the constraints.", "residual", 2),
+    ("evaluate_signal_derivatives", "signal_slopes", "K = the derivatives of the inputs.", "K", 2),
+)
+
+
+@dataclass(frozen=True)
+class SolverModel:
+    """Functions and array sizes that one form of C, portable or optimised, supplies to the library.
+
+    Attributes
+    ----------
+    functions
+        The C functions of the scene.
+    members
+        The arguments of the accelerations and other functions of the model besides the state and
+        time. The struct of the model has them.
+    callbacks
+        The functions that the library calls, with their bodies. Those that it does not use are not
+        emitted.
+    extent
+        Length of C arrays for coordinates, which may include padding.
+    lanes
+        Macro before loops over the stages, by which compilers vectorise them; "" for none.
+    has_constants
+        Whether expressions that depend on parameters only are precomputed and stored in a struct c.
+    compute_constants
+        C call that computes this struct and is nonzero on failure; "" if not needed.
+    has_sweep
+        Whether the form has its own iteration over the stages, `callbacks` included.
+    """
+
+    functions: SceneFunctions
+    members: tuple[CArgument, ...]
+    callbacks: tuple[CFunction, ...]
+    extent: str
+    lanes: str = ""
+    has_constants: bool = False
+    compute_constants: str = ""
+    has_sweep: bool = False
+
+    @property
+    def struct(self) -> tuple[CArgument, ...]:
+        """The members, or none in portable C whose only member is p, which then replaces `m`."""
+        only_p = self.functions.is_portable and [a.name for a in self.members] == ["p"]
+        return () if only_p else self.members
+
+    @property
+    def argument(self) -> tuple[CArgument, ...]:
+        """The argument `m` of the library's functions, in a tuple; empty without members."""
+        type_ = f"{self.functions.prefix}_model"
+        return (c.input_array(type_, "m"),) if self.struct else self.members
+
+    @property
+    def passed(self) -> tuple[str, ...]:
+        """The C expression of this argument where the struct is a variable, in a tuple."""
+        return ("&m",) if self.struct else tuple(a.name for a in self.members)
+
+    @property
+    def arguments(self) -> dict[str, str]:
+        """C expressions of the members in functions with the argument `m`, by name."""
+        return {a.name: c.member("m", a.name) for a in self.struct}
+
+    def value(self, **passed: str) -> str:
+        """Return the C initialiser of the struct; "" without members.
+
+        passed: C expressions of members, by name. Others are variables of the same names.
+        """
+        return c.initialiser(passed.get(a.name, a.name) for a in self.struct)
+
+    def call(self, name: str, *passed: str, last: Sequence[str] = ()) -> str:
+        """Return the C call of a function of the library, where `m` is the struct.
+
+        name: its name in the library after `eom_`. passed, last: C expressions of its arguments
+        before and after the model.
+        """
+        return f"{self.functions.prefix}_{name}({', '.join([*passed, *self.passed, *last])})"
+
+    def variable(self, **passed: str) -> Block:
+        """Return the C definition of the variable `m`, if there are any members.
+
+        passed: C expressions of members, by name. Others are variables of the same names.
+        """
+        type_, value = f"{self.functions.prefix}_model", self.value(**passed)
+        return Block("", (c.define_constant(type_, "m", value),) if value else ())
+
+    def source(self, texts: Iterable[str]) -> tuple[str, ...]:
+        """Return the C text of the struct and of the functions that C texts use, if any."""
+        words = set(re.findall(r"\w+", "\n".join(texts)))
+        used = tuple(f for f in self.callbacks if f.name in words)
+        members = self.struct if f"{self.functions.prefix}_model" in words else ()
+        if not (used or members):
+            return ()
+        return (show("c/model.c", self.functions, members=members, callbacks=used),)
+
+
+def callback(
+    name: str, callee: CFunction, arguments: Sequence[CArgument], doc: str, **passed: str
+) -> CFunction:
+    """Return a static function with arguments of the library that calls a function of the model.
+
+    passed: C expressions of arguments of `callee`, by name. Other arguments are passed as variables
+    of the same names.
+    """
+    call = callee.call(**passed)
+    is_void = callee.result == "void"
+    statement = c.call_statement(call) if is_void else c.return_statement(call)
+    reads = frozenset(re.findall(r"\w+", call))
+    body = (Block("", (statement,)),)
+    return CFunction(name, callee.result, tuple(arguments), body, reads, "static", (doc,))
+
+
+def state_arguments(real: str) -> tuple[CArgument, ...]:
+    """Return the arguments q, qd and t of functions that the library calls."""
+    return (c.input_array(real, "q"), c.input_array(real, "qd"), CArgument(real, "t"))
+
+
+def portable_model(functions: SceneFunctions) -> SolverModel:
+    """Return what portable C supplies to the library."""
+    real, prefix = functions.real, functions.prefix
+    members = functions.public.arguments("u", "p")
+    model = SolverModel(functions, members, (), functions.NQ)
+    passed = model.arguments
+    qdd = c.output_array(real, "qdd")
+    callbacks = [
+        callback(
+            f"{prefix}_accelerate",
+            functions.acceleration.function,
+            (qdd, *state_arguments(real), *model.argument),
+            ACCELERATE,
+            **passed,
+        )
+    ]
+    state = (*state_arguments(real), *model.argument)
+    for name, doc, out, function in (
+        ("correction", CORRECTION, "d", functions.projection),
+        ("rate_terms", RATE_TERMS, "rates", functions.rate_terms),
+    ):
+        if function:
+            arguments = (c.output_array(real, out), *state)
+            inner = function.function
+            callbacks.append(callback(f"{prefix}_evaluate_{name}", inner, arguments, doc, **passed))
+    callbacks += public_callbacks(functions, model)
+    return SolverModel(functions, members, tuple(callbacks), functions.NQ)
+
+
+def public_callbacks(functions: SceneFunctions, model: SolverModel) -> list[CFunction]:
+    """Return the functions that the library calls and that are the same in both forms.
+
+    They are for events, constraints, and derivatives of steps.
+    """
+    real, prefix, public = functions.real, functions.prefix, functions.public
+    passed = model.arguments
+    q, qd, t = state_arguments(real)
+    callbacks = []
+    for name, program_name, doc, array, count in EVALUATIONS:
+        if program_function(functions.target, program_name):
+            callee = public.evaluation(program_name)
+            arguments = (c.output_array(real, array), *(q, qd)[:count], t, *model.argument)
+            own = passed | {callee.arguments[0].name: array}
+            callbacks.append(callback(f"{prefix}_{name}", callee, arguments, doc, **own))
+    if functions.rotation_errors:
+        name, callee = f"{prefix}_evaluate_rotation_errors", functions.rotation_errors.function
+        arguments = (c.output_array(real, "errors"), q, t, *model.argument)
+        callbacks.append(callback(name, callee, arguments, ROTATIONS, **passed))
+    if functions.target.system.events:
+        moved = (c.output_array(real, "q"), c.output_array(real, "qd"), t)
+        arguments = (*moved, CArgument(real, "h"), *model.argument)
+        steps = {public.method_enum(m.name): public.step(m.name) for m in functions.methods}
+        if public.method_type:
+            arguments = (CArgument(public.method_type, "method"), *arguments)
+        lines = c.return_case("method", {k: f.call(**passed) for k, f in steps.items()})
+        reads = frozenset(re.findall(r"\w+", "\n".join(lines)))
+        prototype = c.static_prototype(f"{prefix}_call_step", functions.status, *arguments)
+        body = (Block("", lines),)
+        callbacks.append(replace(prototype, body=body, reads=reads, doc=(CALL_STEP,)))
+    if functions.target.system.run.discretize:
+        callbacks += derivative_callbacks(functions, model)
+    return callbacks
+
+
+def derivative_callbacks(functions: SceneFunctions, model: SolverModel) -> Iterator[CFunction]:
+    """Yield the functions that derivatives of steps call."""
+    real, prefix, public = functions.real, functions.prefix, functions.public
+    passed = model.arguments
+    q, qd, t = state_arguments(real)
+    state, along = (q, qd, t, *model.argument), c.input_array(real, "along")
+    taken = {a.name for a in public.linearization.arguments}
+    accelerations, qdd = functions.acceleration.function, c.output_array(real, "qdd")
+    matrices = [c.output_array(real, name) for name in ("A_q", "A_qd", "B") if name in taken]
+    wrapped = [
+        ("accelerations", accelerations, ACCELERATE, [qdd]),
+        ("linearization", public.linearization, LINEARIZATION, matrices),
+    ]
+    if functions.projection_along:
+        out = [c.output_array(real, "column"), along]
+        callee = functions.projection_along.function
+        wrapped.append(("correction_along", callee, CORRECTION_ALONG, out))
+    for name, callee, doc, first in wrapped:
+        arguments = (*first, *state)
+        yield callback(f"{prefix}_evaluate_{name}", callee, arguments, doc, **passed)
+    moved = (c.output_array(real, "q"), c.output_array(real, "qd"), t, CArgument(real, "h"))
+    for method in functions.methods:
+        name, doc = f"{prefix}_{method.name}_make_step", f"Make a step of {method.title}."
+        step = public.step(method.name)
+        yield callback(name, step, (*moved, *model.argument), doc, **passed)
+
+
+def define(function: CFunction, *blocks: Block) -> str:
+    """Return the C definition of a function that reads all its arguments, with this body."""
+    reads, body = frozenset(a.name for a in function.arguments), tuple(b for b in blocks if b.lines)
+    return replace(function, body=body, reads=reads).definition
+
+
+def projects_stages(method: Method) -> bool:
+    """Return True if the method projects its stages onto constraints where it must."""
+    return method.implicit and not method.newton
+
+
+def step_advance(model: SolverModel, method: Method) -> CFunction:
+    """Return the prototype of the library's function for a step of a method with fixed steps."""
+    functions = model.functions
+    return c.static_prototype(
+        f"{functions.prefix}_{method.name}_advance",
+        functions.status,
+        c.output_array(functions.real, "q"),
+        c.output_array(functions.real, "qd"),
+        CArgument(functions.real, "t"),
+        CArgument(functions.real, "h"),
+        *model.argument,
+        *((CArgument("long *", "evaluations"),) if method.implicit else ()),
+        *((CArgument("int *", "singular"),) if functions.projection else ()),
+    )
+
+
+def step_source(model: SolverModel, method: Method) -> tuple[str, ...]:
+    """Return the library's part of the C source for a method with fixed steps, as definitions."""
+    constrained = bool(model.functions.projection)
+    features = {
+        "CONSTRAINTS": constrained,
+        "NEWTON": method.newton,
+        "PROJECTED_STAGES": constrained and projects_stages(method),
+    }
+    kind = method_kind(method)
+    return amalgamate(
+        STEP_FILES[kind],
+        [f"eom_{kind}_advance", f"eom_{kind}_b", f"eom_{kind}_bA"],
+        library_names(model, method),
+        features,
+        tableau_tables(model.functions, method),
+    )
+
+
+def functions_source(model: SolverModel, file: str, *names: str) -> tuple[str, ...]:
+    """Return functions of one file of the library, as definitions. names: theirs after `eom_`."""
+    return amalgamate((file,), [f"eom_{name}" for name in names], library_names(model), {})
+
+
+def library_names(model: SolverModel, method: Method | None = None, **exact: str) -> Names:
+    """Return the names of the library in the source of a model.
+
+    method: integration method; definitions that depend on it have its name in theirs, such as
+    `ball_gauss16_weights`. exact: texts that replace further names.
+    """
+    functions = model.functions
+    real, prefix, PREFIX = functions.target.real, functions.prefix, functions.PREFIX
+    libm = {f"eom_{name}": name + real.function_suffix for name in LIBM}
+    numbers = {
+        "EOM_EPS": real.epsilon,
+        "EOM_SQRT_EPS": math.sqrt(real.epsilon),
+        "EOM_FOURTH_ROOT_EPS": real.epsilon**0.25,
+        "EOM_TINY": 1e-30,
+        "EOM_HUGE": 1e30,
+    }
+    stages, prefixes = {}, {"eom_": f"{prefix}_", "EOM_": f"{PREFIX}_"}
+    if method:
+        kind = method_kind(method)
+        stages = {f"EOM_{k}_STAGES": str(method.stages) for k in (kind.upper(), "METHOD")}
+        prefixes |= dict.fromkeys((f"eom_{kind}_", "eom_method_"), f"{prefix}_{method.name}_")
+    return Names(
+        exact={
+            **libm,
+            **stages,
+            "EOM_WIDTH": model.extent,
+            "EOM_LANES": model.lanes,
+            **{name: functions.target.literal(x) for name, x in numbers.items()},
+            **exact,
+        },
+        prefixes=prefixes,
+        real=real,
+        model=next(iter(model.argument), None),
+        forwards=tuple(f for f in model.callbacks if functions.is_portable and f.is_forward),
+    )
+
+
+def method_kind(method: Method) -> str:
+    """Return the word in the library's names for methods like this one."""
+    return "gauss" if method.implicit else "explicit"
+
+
+def tableau_tables(functions: SceneFunctions, method: Method) -> tuple[str, ...]:
+    """Return the coefficients of a Runge-Kutta method as C tables under the library's names."""
+    real, name = functions.target.real, f"eom_{method_kind(method)}_"
+    square = [(*row, *[Fraction(0)] * (method.stages - len(row))) for row in method.a]
+    return (
+        c_vector(f"{name}c", method.c, real, f"Coefficients c, A, A A, b, b A of {method.title}."),
+        c_matrix(f"{name}A", square, real),
+        c_matrix(f"{name}AA", method.a_squared, real),
+        c_vector(f"{name}b", round_weights(method.b, real), real),
+        c_vector(f"{name}bA", method.b_a, real),
+    )

@@ -1,0 +1,1 @@
+"""Mechanisms with constraints: assembly, ranks, singular positions, mobility."""
