@@ -93,13 +93,13 @@ def test_every_free_text_field_of_a_scene_is_tested() -> None:
     models: dict[str, Any] = {"": schema.Document} | {
         f.name: model
         for f in dataclasses.fields(schema.Document)
-        if (model := f.metadata.get("table") or f.metadata.get("tables"))
+        if (model := f.metadata["key"].table)
     }
     known = {
         (model, f.name)
         for model in models.values()
         for f in dataclasses.fields(model)
-        if f.metadata.get("check") in (schema.line, schema.note)
+        if f.metadata and f.metadata["key"].type in (schema.line, schema.note)
     }
     paths = (key.split(".") for _, key in fields())
     tested = {(models[path[0] if len(path) > 1 else ""], path[-1]) for path in paths}

@@ -1,4 +1,4 @@
-"""The command: eomc new, import, build, check, run, sweep, report, show, export, dof, list.
+"""The command: eomc new, import, build, check, run, sweep, report, show, schema, export, dof, list.
 
 Exit status: 0 for success, 1 if a check failed or a run could not continue, 2 for bad input. A
 command's module is imported when the command is called, and slow imports (SymPy, rich)
@@ -23,7 +23,7 @@ from eomc.cli.terminal import fail, say
 COMMANDS = {
     "build": "build", "check": "comparison", "dof": "description", "export": "build",
     "import": "scenes", "list": "scenes", "new": "scenes", "report": "comparison", "run": "run",
-    "show": "description", "sweep": "sweep",
+    "schema": "scenes", "show": "description", "sweep": "sweep",
 }  # fmt: skip
 
 

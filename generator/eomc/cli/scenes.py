@@ -1,4 +1,4 @@
-"""eomc new, eomc import and eomc list: write scene files, and list them."""
+"""eomc new, import, schema and list: write scene files and their JSON Schema, and list scenes."""
 
 from __future__ import annotations
 
@@ -203,6 +203,28 @@ def _edit_robot(robot: Robot, arguments: ImportArguments) -> Robot:
         return scene_text.prepare_for_scene(robot)
     except EomcError as fault:
         raise with_left_out_note(fault, robot.left_out) from None
+
+
+# --- schema ---------------------------------------------------------------------------------------
+
+
+@click.command("schema")
+@click.option("--out", type=click.Path(path_type=Path), help="Write the schema to this file.")
+def schema_command(out: Path | None) -> None:
+    """Print the JSON Schema of scenes, with which editors complete and check keys.
+
+    \b
+    eomc schema --out scene.schema.json
+    """
+    from eomc.scene.json_schema import json_schema
+
+    text = json.dumps(json_schema(), indent=1)
+    if out is None:
+        say(text)
+        return
+    options.check_target(out, [".json"], "--out")
+    options.write_text(out, text + "\n")
+    say(f"wrote {escape_line(out)}; in the first line of a scene: #:schema {escape_line(out)}")
 
 
 # --- list -----------------------------------------------------------------------------------------

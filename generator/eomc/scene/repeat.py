@@ -18,7 +18,7 @@ from eomc.scene.formulas import Formula, FormulaError, suggest
 from eomc.scene.scope import Checker, Path, value_of
 from eomc.scene.toml_text import ARRAYS
 
-_TABLES = (
+TABLES = (  # whose entries may be repeated
     "constants", "parameters", "coordinates", "inputs", "definitions", "forces", "constraints",
 )  # fmt: skip
 _PLAIN = ("definitions", "forces")  # tables with formulas as entries
@@ -67,10 +67,10 @@ class _Expansion:
                 self.check.report((written,), f"{unknown}write [[{array_name}]]")
                 self.tree[array_name] = entries
                 self.check.places.rename((written,), (array_name,))
-        for table in _TABLES:
+        for table in TABLES:
             if isinstance(self.tree.get(table), dict):
                 self.declared |= dict.fromkeys(self.tree[table], table)
-        for table in _TABLES:
+        for table in TABLES:
             if isinstance(self.tree.get(table), dict):
                 self.tree[table] = self._expand_table(table, self.tree[table])
         for array in ARRAYS:

@@ -30,9 +30,9 @@ from eomc.scene.scene import (
     Vector,
 )
 from eomc.scene.schema import BodyTable, Document, EventTable
-from eomc.scene.schema import Place as Written
 from eomc.scene.scope import INPUT, VELOCITY, Checker, Path
 from eomc.scene.toml_text import SourceMap
+from eomc.scene.value_types import Place as Written
 
 WORLD_TAKEN = {WORLD: "is the frame that does not move"}
 MOMENT_TOLERANCE = 1e-6  # relative: files give moments of inertia to six digits and more
@@ -339,7 +339,7 @@ class ValueChecker(Checker):
 # --- coordinates ----------------------------------------------------------------------------------
 
 SUSPICIOUS_ANGLE = 7.0  # rad, more than one turn
-FRICTION_WIDTH = formulas.parse("0.01")  # rad/s or m/s
+FRICTION_WIDTH = formulas.parse(schema.FRICTION_WIDTH)
 
 
 def check_coordinates(check: ValueChecker) -> Iterator[SceneCoordinate]:

@@ -16,7 +16,7 @@ from eomc.integrators.tableaux import GAUSS16, Row
 from eomc.model.mechanics import has_steep_terms
 from eomc.model.system import System
 from eomc.program import outline
-from eomc.scene.schema import MAX_TOLERANCE
+from eomc.scene.value_types import MAX_TOLERANCE
 
 METHOD = GAUSS16
 TITLE = f"the implicit method of Gauss and Legendre with {METHOD.stages} stages"
