@@ -231,6 +231,29 @@ def test_dask_goes_on_without_killed_workers(reference: Any, scene: Path, tmp_pa
     assert int((dataset["status"] == NOT_RUN).sum()) == 256
 
 
+@pytest.mark.slow
+def test_a_sweep_goes_on_after_the_loss_of_the_scheduler(
+    reference: Any, scene: Path, tmp_path: Path
+) -> None:
+    distributed = pytest.importorskip("distributed")
+    address, out = tmp_path / "scheduler.json", tmp_path / "a.zarr"
+    run = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0"]
+    options = ["--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", str(address)]
+    with subprocess.Popen([*run, *options], stderr=subprocess.DEVNULL) as scheduler:
+        worker = [sys.executable, "-m", "distributed.cli.dask_worker", "--no-nanny"]
+        worker += ["--scheduler-file", str(address), "--death-timeout", "5"]
+        with subprocess.Popen(worker, stderr=subprocess.DEVNULL) as process:
+            client = distributed.Client(scheduler_file=str(address), timeout=60)
+            client.wait_for_workers(1, timeout=60)
+            arguments = SWEEP | {"block": 256, "client": client}
+            with pytest.raises(EomcError, match=r"the scheduler was lost: .*run the same again"):
+                sweep(scene, **arguments, out=out, progress=lambda state: scheduler.kill())
+            client.close(timeout=1)
+            process.terminate()
+    assert Store(out).finished().any()
+    assert are_equal(reference, sweep(scene, **SWEEP, out=out))
+
+
 def test_the_scene_of_these_tests_has_the_parameter_m_first() -> None:
     """`ends_or_kill` reads it."""
     assert SCENE.index("m = 1.0") < SCENE.index("l = 1.0")

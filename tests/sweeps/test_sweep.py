@@ -348,10 +348,72 @@ def test_another_folder_stays_as_it_is(scene: Path, tmp_path: Path) -> None:
     assert not [*tmp_path.glob("*.lock")]
 
 
+NOISE: dict[str, Any] = {"noise": {"torque": {"normal": [0.0, 0.5]}}, "control_period": 0.05}
+
+
+def damp(t: float, q: Any, qd: Any) -> Any:
+    return -2 * q - 0.5 * qd + t
+
+
+def return_nothing_finite(t: float, q: Any, qd: Any) -> Any:
+    return np.full(q.shape, np.nan)
+
+
+def return_one_number(t: float, q: Any, qd: Any) -> Any:
+    return [1.0, 2.0, 3.0]
+
+
+def test_noise_depends_on_the_index_alone(scene: Path, tmp_path: Path) -> None:
+    draws = {"theta": DRAWS["theta"]}
+    one = sweep(scene, draws=draws, n=600, block=256, **NOISE, out=tmp_path / "a.zarr")
+    two = sweep(scene, over={"m": [1.0, 2.0]}, draws=draws, n=600, **NOISE, out=tmp_path / "b.zarr")
+    assert np.array_equal(one["theta"].values, two["theta"].values[0])  # the scene has m = 1
+    uniforms = axes.random_uniforms(0, "noise torque", 0, 4 * 600).reshape(600, 4)
+    noise = axes.inverse_cdf({"normal": [0.0, 0.5]}, uniforms)
+    starts = {"theta": one["theta_start"].values}
+    runs = eomc.load(scene).simulate_batch(starts, u={"torque": noise}, control_period=0.05)
+    assert np.array_equal(one["theta"].values, runs.q[:, -1, 0])
+    grid = sweep(
+        scene, over={"m": [1.0], "theta": starts["theta"]}, block=256, **NOISE,
+        out=tmp_path / "c.zarr",
+    )  # fmt: skip
+    assert np.array_equal(one["theta"].values, grid["theta"].values[0])
+
+
+def test_policies_are_called_once_in_each_control_period(scene: Path, tmp_path: Path) -> None:
+    starts = np.linspace(-1.0, 1.0, 5)
+    arguments: dict[str, Any] = {"over": {"theta": starts}, "policy": damp, "control_period": 0.03}
+    dataset = sweep(scene, **arguments, out=tmp_path / "a.zarr")
+    module = eomc.load(scene)
+    runs = [module.simulate([x], u=damp, control_period=0.03) for x in starts]
+    expected = [run.q[-1, 0] for run in runs]
+    assert dataset["theta"].values == pytest.approx(expected, rel=1e-13)
+    noisy = sweep(scene, **{**arguments, **NOISE}, out=tmp_path / "b.zarr")
+    assert not np.any(noisy["theta"].values == dataset["theta"].values)
+    with pytest.raises(EomcError, match="policy: another text there"):
+        sweep(scene, **{**arguments, "policy": return_one_number}, out=tmp_path / "a.zarr")
+
+
+def test_different_processors_are_reported(scene: Path, tmp_path: Path) -> None:
+    arguments: dict[str, Any] = {"over": {"m": [1, 2, 3]}, "out": tmp_path / "a.zarr"}
+    sweep(scene, **arguments)
+    Store(tmp_path / "a.zarr").mark_processor("another processor")
+    with pytest.warns(RuntimeWarning, match="workers have different processors"):
+        dataset = sweep(scene, **arguments)
+    assert {*dataset.variables} == {"status", "theta", "theta_dot", "m"}
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({}, "nothing varies"),
+        ({"over": {"m": {"from": 1, "to": 1, "n": 3}}}, "from and to are both 1"),
+        ({"over": {"m": [1]}, "control_period": 0.1}, "control_period: goes with noise or a"),
+        ({"over": {"m": [1]}, **NOISE, "control_period": 0.013}, "control_period: .* 1.3 steps"),
+        ({"over": {"m": [1]}, "noise": {"torqe": {"normal": [0, 1]}}}, "did you mean 'torque'"),
+        ({"over": {"m": [1]}, "noise": {"torque": {"normal": [0]}}}, "torque: normal has the"),
+        ({"over": {"m": [1]}, "policy": return_nothing_finite}, "policy: return finite numbers"),
+        ({"over": {"m": [1]}, "policy": return_one_number}, r"policy: return .*shape \(1, 1\)"),
         ({"draws": DRAWS}, "n: how many draws"),
         ({"over": {"thetta": [1]}}, "thetta: no coordinate, .*did you mean 'theta'"),
         ({"over": {"m": [1]}, "draws": DRAWS, "n": 3}, "m: is in over as well"),

@@ -211,6 +211,7 @@ def test_faults_in_a_file_are_shown_at_their_line(
         (["--part", "4/3"], "give K/N with 1 <= K <= N"),
         (["--workers", "2", "--scheduler", "tcp://a:1"], "choose one"),
         (["--plot", "a.txt"], "--plot a.txt"),
+        (["--status", "--plot", "a.png"], "leave out --plot and --parquet"),
     ],
 )
 def test_wrong_options_are_refused(options: list[str], message: str, folder: Path) -> None:

@@ -123,6 +123,8 @@ def _run(command: SimpleNamespace, arguments: SweepArguments) -> None:
     if command.workers is not None and command.scheduler is not None:
         raise EomcError("--workers and --scheduler: choose one")
     if command.status:
+        if command.plot or command.parquet:
+            raise EomcError("--status computes and writes nothing: leave out --plot and --parquet")
         _print_status(command, prepare_sweep(arguments, command.out))
         return
     client = command.scheduler if command.workers is None else command.workers

@@ -84,6 +84,8 @@ def read_axis(path: tuple[str, ...], value: Any) -> list[float]:
             raise SweepError(path, f"n: give the number of values, 1 or more, here {n!r}")
         if spacing is np.geomspace and not (low > 0 and high > 0):
             raise SweepError(path, f"a logarithmic scale needs positive limits, here {low}, {high}")
+        if n > 1 and low == high:
+            raise SweepError(path, f"from and to are both {low}, with n = {n}: give n = 1")
         value = spacing(low, high, n)
     try:
         values = np.asarray(value, float)

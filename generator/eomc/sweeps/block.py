@@ -22,14 +22,14 @@ from typing import Any
 import numpy as np
 
 from eomc.base.errors import EomcError
-from eomc.sweeps.axes import Array, SweepError, draw_values
-from eomc.sweeps.plan import OVER_ROWS, OutputFunction, Plan
+from eomc.sweeps.axes import Array, SweepError, draw_values, inverse_cdf, random_uniforms
+from eomc.sweeps.plan import OVER_ROWS, OutputFunction, Plan, Policy
 from eomc.sweeps.reductions import part_of_block
 from eomc.sweeps.store import Region, Store, open_store, part_name
 
 # A call of simulate_batch takes so many instances, whose states then fit in the cache, and so many
-# bytes of rows.
-MAX_INSTANCES, MAX_ROW_BYTES = 4096, 1 << 25
+# bytes of rows, and of noise, which is read once and should stay in the cache.
+MAX_INSTANCES, MAX_ROW_BYTES, MAX_NOISE_BYTES = 4096, 1 << 25, 1 << 20
 PROBE_INSTANCES, PROBE_SECONDS = 64, 0.1
 
 _modules: dict[str, Any] = {}
@@ -49,20 +49,20 @@ class Task:
     threads: int
     client: tuple[str, int]
     function: OutputFunction | None
+    policy: Policy | None
 
 
 @dataclass(frozen=True)
 class BlockReport:
     """A worker's report of a block: numbers of trajectories, and computing times in s.
 
-    failures: number of failed trajectories by status. processor: the worker's processor.
+    failures: number of failed trajectories by status.
     """
 
     trajectories: int
     failures: dict[str, int]
     seconds: float
     simulation_seconds: float
-    processor: str
 
 
 @dataclass(frozen=True)
@@ -135,40 +135,98 @@ def _flags(bits: str) -> Iterator[None]:
 # --- simulation -----------------------------------------------------------------------------------
 
 
-def values_of_block(plan: Plan, region: Region) -> dict[str, Array]:
-    """Return the values of each varied quantity, (trajectories,), in a part of the sweep's shape.
+@dataclass(frozen=True)
+class Instances:
+    """Trajectories of a part of a sweep.
 
-    The draws are the same at every point of the grid (common random numbers).
+    values: those of each varied quantity, (batch,). indices: numbers (batch,) on which their noise
+    depends.
+    """
+
+    values: Mapping[str, Array]
+    indices: Array
+
+    def take(self, which: Any) -> Instances:
+        """Return some of the instances, by their numbers or a slice."""
+        return Instances({name: x[which] for name, x in self.values.items()}, self.indices[which])
+
+
+def instances_of_block(plan: Plan, region: Region) -> Instances:
+    """Return the instances of a part of the sweep's shape.
+
+    Draws and noise are the same at every point of the grid (common random numbers).
     """
     sizes = tuple(s.stop - s.start for s in region)
     values = {}
     for k, (name, axis) in enumerate(plan.over.items()):
         own = np.asarray(axis)[region[k]].reshape(-1, *(1,) * (len(sizes) - 1 - k))
         values[name] = np.broadcast_to(own, sizes).ravel()
-    if plan.draws:
-        sampling = (plan.sampler, plan.seed, plan.n)
-        drawn = draw_values(plan.draws, sampling, region[-1].start, region[-1].stop)
-        values |= {name: np.broadcast_to(x, sizes).ravel() for name, x in drawn.items()}
-    return values
+    if not plan.draws:
+        first = int(np.ravel_multi_index([s.start for s in region], plan.shape))
+        return Instances(values, np.arange(first, first + math.prod(sizes)))
+    start, stop = region[-1].start, region[-1].stop
+    drawn = draw_values(plan.draws, (plan.sampler, plan.seed, plan.n), start, stop)
+    values |= {name: np.broadcast_to(x, sizes).ravel() for name, x in drawn.items()}
+    return Instances(values, np.broadcast_to(np.arange(start, stop), sizes).ravel())
 
 
-def simulate(model: Any, plan: Plan, values: Mapping[str, Array], threads: int) -> Any:
-    """Simulate a batch with these values of the varied quantities, (batch,)."""
-    n = len(next(iter(values.values())))
+def simulate(
+    model: Any, plan: Plan, instances: Instances, threads: int, policy: Policy | None
+) -> Any:
+    """Simulate a batch of instances."""
+    n = len(instances.indices)
     q0, qd0 = (np.tile(np.asarray(x, float), (n, 1)) for x in model.start)
     names, inputs = list(model.coordinates), dict[str, Any](plan.inputs)
     params: dict[str, Array] = {}
-    for name, x in values.items():
+    for name, x in instances.values.items():
         if name in plan.starts:
             start = q0 if name in names else qd0
             start[:, names.index(name.removesuffix("_dot") if start is qd0 else name)] = x
         else:
             (inputs if name in model.inputs else params)[name] = x
-    every = {"every": plan.every} if plan.every else {}
+    for name, distribution in plan.noise.items():
+        noise = _noise(plan, name, distribution, instances.indices)
+        inputs[name] = np.reshape(inputs.get(name, 0.0), (-1, 1)) + noise
+    options = {**plan.run, "params": params or None, "threads": threads}
+    if plan.every:
+        options["every"] = plan.every
     with np.errstate(all="ignore"):
-        return model.simulate_batch(
-            q0, qd0, params=params or None, u=inputs or None, threads=threads, **every, **plan.run
-        )
+        u: Any = inputs or None
+        if policy is not None:
+            u = _inputs_of_policy(model, plan, (q0.copy(), qd0.copy()), inputs, options, policy)
+        return model.simulate_batch(q0, qd0, u=u, **options)
+
+
+def _noise(plan: Plan, name: str, distribution: Mapping[str, Any], indices: Array) -> Array:
+    """Return the noise (batch, periods) of an input, by the indices of the instances."""
+    first, last, periods = int(indices.min()), int(indices.max()) + 1, plan.periods
+    u = random_uniforms(plan.seed, f"noise {name}", first * periods, last * periods)
+    return np.asarray(inverse_cdf(distribution, u).reshape(-1, periods)[indices - first])
+
+
+def _inputs_of_policy(
+    model: Any, plan: Plan, state: tuple[Array, Array], noise: Mapping[str, Array],
+    options: Mapping[str, Any], policy: Policy,
+) -> Array:  # fmt: skip
+    """Return the inputs (batch, periods, nu) of a rollout, by a step of each control period.
+
+    state: initial positions and velocities, which are advanced. noise: that of inputs, (batch,
+    periods), which is added to the inputs of the policy.
+    """
+    (q, qd), step = state, {k: options[k] for k in ("params", "threads", "method") if k in options}
+    h, t = plan.run["h"], plan.run.get("t0", 0.0)
+    count = round(plan.run["control_period"] / h)
+    table = np.empty((len(q), plan.periods, model.nu))
+    for k in range(plan.periods):
+        u = np.asarray(policy(t + k * count * h, q.copy(), qd.copy()), float)
+        if u.size != len(q) * model.nu or not np.isfinite(u).all():
+            why = f"return finite numbers of shape {(len(q), model.nu)}, here {u.shape}"
+            raise SweepError(("policy",), why)
+        table[:, k] = u.reshape(len(q), -1)
+        for name, values in noise.items():
+            table[:, k, model.inputs.index(name)] += values[:, k]
+        model.step_batch(q, qd, h, t + k * count * h, table[:, k].copy(), steps=count, **step)
+    return table
 
 
 def quantities_of(plan: Plan, function: OutputFunction | None, runs: Any) -> dict[str, Array]:
@@ -209,24 +267,24 @@ def _event_quantity(runs: Any, event: str, quantity: str, starts: list[str]) -> 
     return first
 
 
-def probe(model: Any, plan: Plan, function: OutputFunction | None) -> Probe:
+def probe(model: Any, plan: Plan, function: OutputFunction | None, policy: Policy | None) -> Probe:
     """Simulate the first trajectories of a sweep, to find every fault before a worker does.
 
     Raises SweepError if a quantity does not have a value for each trajectory.
     """
     region = [slice(0, 1)] * (len(plan.shape) - 1) + [slice(0, min(4, plan.shape[-1]))]
-    values = values_of_block(plan, tuple(region))
-    count = len(next(iter(values.values())))
+    instances = instances_of_block(plan, tuple(region))
+    count = len(instances.indices)
     with warnings.catch_warnings():
         ignore_failures()
         started_at = time.perf_counter()
-        runs = simulate(model, plan, values, 1)
+        runs = simulate(model, plan, instances, 1, policy)
         quantities = quantities_of(plan, function, runs)
         seconds = (time.perf_counter() - started_at) / count
         if seconds * count < PROBE_SECONDS:
-            many = {name: np.resize(x, PROBE_INSTANCES) for name, x in values.items()}
+            many = instances.take(np.arange(PROBE_INSTANCES) % count)
             started_at = time.perf_counter()
-            quantities_of(plan, function, simulate(model, plan, many, 1))
+            quantities_of(plan, function, simulate(model, plan, many, 1, policy))
             seconds = (time.perf_counter() - started_at) / PROBE_INSTANCES
     for name, x in quantities.items():
         if not x.shape or len(x) != count or x.dtype.kind not in "fiub":
@@ -261,9 +319,10 @@ def run_block(task: Task, cancelled: Callable[[], bool] = lambda: False) -> Bloc
         if task.client == process_name():
             raise
         raise EomcError(f"worker {':'.join(map(str, process_name()))}: {fault}") from None
+    store.mark_processor(processor())
     plan = store.plan
     at, region = store.place(task.number)
-    values = values_of_block(plan, region)
+    instances = instances_of_block(plan, region)
     total = math.prod(s.stop - s.start for s in region)
     status, collected = np.empty(total, np.uint8), dict[str, Array]()
     simulation_seconds = 0.0
@@ -271,7 +330,7 @@ def run_block(task: Task, cancelled: Callable[[], bool] = lambda: False) -> Bloc
         if cancelled():
             return None
         before = time.perf_counter()
-        runs = simulate(model, plan, {k: x[part] for k, x in values.items()}, task.threads)
+        runs = simulate(model, plan, instances.take(part), task.threads, task.policy)
         simulation_seconds += time.perf_counter() - before
         status[part] = runs.status_codes
         for name, x in quantities_of(plan, task.function, runs).items():
@@ -279,18 +338,21 @@ def run_block(task: Task, cancelled: Callable[[], bool] = lambda: False) -> Bloc
                 collected[name] = np.empty((total, *x.shape[1:]), x.dtype)
             collected[name][part] = x
     if plan.keep_draws:
-        collected |= {plan.label(name): values[name] for name in plan.draws}
+        collected |= {plan.label(name): instances.values[name] for name in plan.draws}
     _write(store, at, region, collected, status)
     codes, counts = np.unique(status[status > 0], return_counts=True)
     failures = {model.STATUS[k]: int(n) for k, n in zip(codes, counts, strict=True)}
     seconds = time.perf_counter() - started_at
-    return BlockReport(total, failures, seconds, simulation_seconds, processor())
+    return BlockReport(total, failures, seconds, simulation_seconds)
 
 
 def _parts(model: Any, store: Store, total: int) -> Iterator[slice]:
     """Yield the slices of a block that are simulated in one call each."""
     row_bytes = 8 * store.facts["rows"] * (2 * model.nq + model.nu + 1)
-    size = max(1, min(MAX_INSTANCES, MAX_ROW_BYTES // row_bytes))
+    size = min(MAX_INSTANCES, MAX_ROW_BYTES // row_bytes)
+    if store.plan.noise and not store.plan.policy:
+        size = min(size, MAX_NOISE_BYTES // (8 * store.plan.periods))
+    size = max(1, size)
     for start in range(0, total, size):
         yield slice(start, min(start + size, total))
 

@@ -10,7 +10,7 @@ import numpy as np
 from eomc.base import texts
 from eomc.base.errors import EomcError, writing
 from eomc.sweeps.reductions import merge
-from eomc.sweeps.store import Store, part_name
+from eomc.sweeps.store import PROCESSORS, Store, part_name
 
 
 def open_dataset(path: Path) -> Any:
@@ -20,6 +20,7 @@ def open_dataset(path: Path) -> Any:
     store = Store(path)
     plan = store.plan
     dataset = xarray.open_zarr(str(path), consolidated=False, mask_and_scale=False, chunks=None)
+    dataset = dataset.drop_vars(PROCESSORS)
     dataset.attrs = {"scene": plan.name, "seed": plan.seed, "sampler": plan.sampler}
     outer = plan.dims[:-1]
     for name, reductions in plan.reduce.items():

@@ -35,9 +35,10 @@ from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.sweeps.axes import SweepError
 from eomc.sweeps.block import BlockReport, Task, ignore_failures, process_name, run_block
-from eomc.sweeps.plan import OutputFunction
+from eomc.sweeps.plan import OutputFunction, Policy
 from eomc.sweeps.store import Store
 
+Functions = tuple[OutputFunction | None, Policy | None]
 WINDOW = 4  # blocks for each worker that are submitted at a time
 
 
@@ -100,8 +101,8 @@ class SweepProgress:
         Number of failed trajectories by status.
     excluded : dict
         Reason by number of each block that was left out, since it ended its workers.
-    processors : set of str
-        Processors of the workers.
+    processors : int
+        Number of kinds of processors that have computed blocks of the store.
     """
 
     blocks: int
@@ -113,7 +114,7 @@ class SweepProgress:
     simulation_seconds: float = 0.0
     failures: Counter[str] = field(default_factory=Counter)
     excluded: dict[int, str] = field(default_factory=dict)
-    processors: set[str] = field(default_factory=set)
+    processors: int = 0
     computed: int = 0
 
     def __str__(self) -> str:
@@ -128,13 +129,15 @@ class SweepProgress:
 
 
 def compute_blocks(
-    store: Store, numbers: Sequence[int], execution: Execution, function: OutputFunction | None
+    store: Store, numbers: Sequence[int], execution: Execution, functions: Functions
 ) -> SweepProgress:
     """Compute blocks of a store; return the state at the end.
 
+    functions: that of the stored quantities and the policy, or None.
+
     Raises EomcError if the computation can't go on; finished blocks stay in the store.
     """
-    window = _Window(store, numbers, execution, function)
+    window = _Window(store, numbers, execution, functions)
     client = execution.client
     if not window.waiting:
         return window.state
@@ -159,7 +162,7 @@ def _executor(client: Any) -> Iterator[Executor]:
         except ImportError:
             raise EomcError("Dask needs more packages: pip install distributed") from None
         try:
-            own = Client(client)
+            own = Client(client, timeout=10)  # s
         except (OSError, ValueError) as fault:
             why = texts.line(str(fault))
             raise EomcError(f"no Dask scheduler at {texts.line(client)} ({why})") from None
@@ -178,15 +181,11 @@ class _Window:
     """The blocks that wait, those that are submitted, and the state of the sweep."""
 
     def __init__(
-        self,
-        store: Store,
-        numbers: Sequence[int],
-        execution: Execution,
-        function: OutputFunction | None,
+        self, store: Store, numbers: Sequence[int], execution: Execution, functions: Functions
     ) -> None:
         self.execution, self.started_at = execution, time.perf_counter()
         place, how = (str(store.path), store.stamp), (execution.threads_of_block, process_name())
-        self.waiting = deque(Task(*place, k, *how, function) for k in numbers)
+        self.waiting = deque(Task(*place, k, *how, *functions) for k in numbers)
         self.running: dict[Future[BlockReport | None], Task] = {}
         self.state = SweepProgress(store.blocks, int(store.finished().sum()), len(numbers))
 
@@ -266,7 +265,6 @@ class _Window:
         state.worker_seconds += report.seconds
         state.simulation_seconds += report.simulation_seconds
         state.failures.update(report.failures)
-        state.processors.add(report.processor)
         self._report_progress()
 
     def _exclude(self, task: Task, why: str) -> None:

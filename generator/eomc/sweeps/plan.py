@@ -18,17 +18,18 @@ from eomc.base import texts
 from eomc.base.errors import EomcError, SceneError
 from eomc.base.resources import __version__
 from eomc.runtime.package import model_of
+from eomc.runtime.requests import count_input_periods
 from eomc.scene.toml_text import SourceMap, text_and_tree
 from eomc.sweeps.axes import SAMPLERS, SweepError, check_name, read_axis, read_distribution
 
 # arguments of simulate_batch that a sweep passes on
 RUN_OPTIONS = (
-    "duration", "every", "h", "max_evaluations", "max_step", "method", "steps", "stiff", "t0",
-    "times", "tol",
+    "control_period", "duration", "every", "h", "max_evaluations", "max_step", "method", "steps",
+    "stiff", "t0", "times", "tol",
 )  # fmt: skip
 FILE_KEYS = (
-    "bits", "draws", "eomc_sweep", "inputs", "keep", "keep_draws", "over", "reduce", "run", "scene",
-    "seed",
+    "bits", "draws", "eomc_sweep", "inputs", "keep", "keep_draws", "noise", "over", "reduce", "run",
+    "scene", "seed",
 )  # fmt: skip
 # functions over the rows of a trajectory, which leave out the rows after its end
 OVER_ROWS = {"max": np.fmax.reduce, "min": np.fmin.reduce}
@@ -37,6 +38,8 @@ ONLY_ENDS = 10**9  # steps between two rows, of which then the first and the las
 
 # receives a BatchTrajectory, and returns a dict of arrays (batch, ...)
 OutputFunction = Callable[[Any], Mapping[str, Any]]
+# receives t, q and qd (batch, nq), and returns the inputs (batch, nu)
+Policy = Callable[[float, Any, Any], Any]
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,8 @@ class SweepArguments:
     sampler: str = "random"
     seed: int = 0
     inputs: Mapping[str, float] = field(default_factory=dict)
+    noise: Mapping[str, Any] = field(default_factory=dict)
+    policy: Policy | None = None
     outputs: Any = None
     reduce: Mapping[str, Any] = field(default_factory=dict)
     keep_draws: bool | None = None
@@ -69,10 +74,15 @@ class Plan:
         Values of each axis of the grid, and distribution of each drawn quantity, by name.
     n : int
         Number of draws at each point of the grid; 0 without draws.
+    noise : dict
+        Distribution of the noise of each noisy input.
+    periods : int
+        Number of control periods, each with its own noise or call of the policy; 0 without them.
     outputs : list of str
         Stored quantities; empty if a function computes them.
-    function : str
-        Digest of the source text of the function that computes the quantities, or "".
+    function, policy : str
+        Digest of the source text of the function that computes the quantities, and of the policy;
+        "" if there is none.
     reduce : dict
         For each reduced quantity a list of [kind, numbers].
     every : int
@@ -89,6 +99,9 @@ class Plan:
     sampler: str
     seed: int
     inputs: dict[str, float]
+    noise: dict[str, dict[str, Any]]
+    policy: str
+    periods: int
     outputs: list[str]
     function: str
     reduce: dict[str, list[list[Any]]]
@@ -137,7 +150,7 @@ class Plan:
         old, new = _flatten(asdict(self)), _flatten(asdict(other))
         for key in sorted({*old, *new}):
             if old.get(key) != new.get(key):
-                if key in ("scene", "function"):
+                if key in ("scene", "function", "policy"):
                     yield f"{key}: another text there"
                 else:
                     yield f"{key}: {_shorten(old.get(key))} there, {_shorten(new.get(key))} now"
@@ -196,7 +209,7 @@ def make_plan(arguments: SweepArguments, model: Any, scene: tuple[str, str]) -> 
 
     a, starts = arguments, [x for c in model.coordinates for x in (c, f"{c}_dot")]
     known = [*starts, *model.parameters, *model.inputs]
-    for table in ("over", "draws", "inputs", "reduce"):
+    for table in ("over", "draws", "inputs", "noise", "reduce"):
         if not isinstance(x := getattr(a, table), Mapping):
             raise SweepError((table,), f"give a dict of names and values, here {x!r}")
     for table in ("over", "draws"):
@@ -207,10 +220,13 @@ def make_plan(arguments: SweepArguments, model: Any, scene: tuple[str, str]) -> 
         raise SweepError(("draws", both[0]), "is in over as well: give it once")
     if not a.over and not a.draws:
         raise SweepError(("over",), "nothing varies: give over or draws (--over, --draw)")
-    for name in a.inputs:
-        check_name(("inputs", name), name, model.inputs, f"no input of {scene[0]}")
+    for table in ("inputs", "noise"):
+        for name in getattr(a, table):
+            check_name((table, name), name, model.inputs, f"no input of {scene[0]}")
     check_name(("bits",), a.bits, ("native", "portable"), f"no kind {a.bits!r}")
-    run = _read_run(a.run)
+    run, noise = _read_run(a.run), {}
+    for name, x in a.noise.items():
+        noise[name] = read_distribution(("noise", name), x)
     outputs = _read_outputs(a, starts)
     reduce = {name: _read_reductions(("reduce", name), x) for name, x in a.reduce.items()}
     if reduce and not a.draws:
@@ -219,15 +235,18 @@ def make_plan(arguments: SweepArguments, model: Any, scene: tuple[str, str]) -> 
         for name in () if callable(a.outputs) else names:
             path = (table, name) if table == "reduce" else (table,)
             _check_quantity(path, name, model_of(model).info, starts)
+    trial, periods = _try_run(a, model, run)
+    every = _choose_rows(a, trial, run.pop("every", None), [*outputs, *reduce])
     return Plan(
         name=scene[0], scene=scene[1],
         over={name: read_axis(("over", name), x) for name, x in a.over.items()},
         draws={name: read_distribution(("draws", name), x) for name, x in a.draws.items()},
         n=_read_count(a), sampler=a.sampler, seed=_read_integer("seed", a.seed),
-        inputs={name: float(x) for name, x in a.inputs.items()}, outputs=outputs,
-        function=_source_digest(a.outputs) if callable(a.outputs) else "",
+        inputs={name: float(x) for name, x in a.inputs.items()}, noise=noise,
+        policy="" if a.policy is None else _source_digest("policy", a.policy), outputs=outputs,
+        function=_source_digest("outputs", a.outputs) if callable(a.outputs) else "",
         reduce=reduce, keep_draws=not reduce if a.keep_draws is None else bool(a.keep_draws),
-        bits=a.bits, run=run, every=_choose_rows(a, model, run, [*outputs, *reduce]), starts=starts,
+        bits=a.bits, run=run, every=every, periods=periods, starts=starts,
         versions={"eomc": __version__, "numpy": np.__version__, "scipy": scipy.__version__},
     )  # fmt: skip
 
@@ -311,24 +330,46 @@ def _check_quantity(path: tuple[str, ...], name: str, info: Any, starts: Sequenc
         raise SweepError(path, f"after {head} and a dot: {', '.join(known)}, here {tail!r}")
 
 
-def _choose_rows(
-    a: SweepArguments, model: Any, run: dict[str, Any], quantities: Sequence[str]
-) -> int:
-    """Return the number of steps between two rows; 0 if rows are not counted in steps."""
-    every = run.pop("every", None)
-    over_rows = [name for name in quantities if name.partition(".")[2] in OVER_ROWS]
+def _try_run(a: SweepArguments, model: Any, run: dict[str, Any]) -> tuple[Any, int]:
+    """Return a run of one trajectory, and the number of control periods of noise or a policy."""
+    options, period, is_driven = dict(run), None, bool(a.noise or a.policy)
+    options.pop("every", None)
+    if is_driven:
+        period = options.pop("control_period", None)
+        missing = {*model.inputs} - {*a.inputs, *a.noise, *a.over, *a.draws}
+        if missing and a.policy is None:
+            raise SweepError(
+                ("inputs",), f"noise replaces all signals: give {min(missing)} as well"
+            )
+    elif "control_period" in run:
+        raise SweepError(("run", "control_period"), "goes with noise or a policy")
     try:
-        is_adaptive = model.simulate_batch(threads=1, **run).tol > 0
+        trial = model.simulate_batch(threads=1, **options)
+        info = model_of(model).info
+        periods = count_input_periods(info, trial.request, period)[1] if is_driven else 0
     except (ValueError, TypeError) as fault:
         name, _, why = str(fault).partition(": ")
         path = ("run", name) if name in run else ("run",)
         raise SweepError(path, why if name in run else str(fault)) from None
-    if "times" in run or is_adaptive:
+    if a.policy is not None and (trial.tol > 0 or info.events):
+        raise SweepError(("policy",), "needs fixed steps (h=), and a scene without events")
+    if a.policy is not None:
+        run["h"] = float(trial.h)
+        run.setdefault("control_period", run["h"])
+    if is_driven and not periods:
+        raise SweepError(("run",), "noise with adaptive steps needs control_period, in s")
+    return trial, periods
+
+
+def _choose_rows(a: SweepArguments, trial: Any, every: Any, quantities: Sequence[str]) -> int:
+    """Return the number of steps between two rows; 0 if rows are not counted in steps."""
+    over_rows = [name for name in quantities if name.partition(".")[2] in OVER_ROWS]
+    if "times" in a.run or trial.tol > 0:
         if every is not None:
             raise SweepError(
                 ("run", "every"), "counts fixed steps: leave it out, or leave out times"
             )
-        if over_rows and "times" not in run:
+        if over_rows and "times" not in a.run:
             why = "adaptive steps have rows at the start and at the end alone: give times"
             raise SweepError(("keep", over_rows[0]), why)
         return 0
@@ -337,13 +378,13 @@ def _choose_rows(
     return ONLY_ENDS
 
 
-def _source_digest(function: OutputFunction) -> str:
+def _source_digest(name: str, function: Any) -> str:
     """Return the digest of the source text of a function, by which a resumed sweep compares it."""
     try:
         return hashlib.sha256(inspect.getsource(function).encode()).hexdigest()
     except (OSError, TypeError):
         why = "a function without source text can't be compared when the sweep goes on: "
-        raise SweepError(("outputs",), f"{why}write it into a file") from None
+        raise SweepError((name,), f"{why}write it into a file") from None
 
 
 # --- files ----------------------------------------------------------------------------------------
@@ -381,16 +422,16 @@ def _read_tree(tree: Mapping[str, Any], folder: Path) -> SweepArguments:
         raise SweepError(("eomc_sweep",), "write eomc_sweep = 1, the version of the format")
     if not isinstance(tree.get("scene"), str):
         raise SweepError(("scene",), 'name the file of the scene, such as scene = "cartpole.toml"')
-    tables = ("over", "draws", "inputs", "run", "reduce")
+    tables = ("over", "draws", "inputs", "noise", "run", "reduce")
     for key in tables:
         if not isinstance(tree.get(key, {}), dict):
             raise SweepError((key,), f"is a table: write [{key}]")
-    over, draws, inputs, run, reduce = (dict(tree.get(key, {})) for key in tables)
+    over, draws, inputs, noise, run, reduce = (dict(tree.get(key, {})) for key in tables)
     return SweepArguments(
         scene=folder / tree["scene"], over=over, n=draws.pop("n", None),
         sampler=draws.pop("sampler", "random"), draws=draws, seed=tree.get("seed", 0),
-        inputs=inputs, outputs=tree.get("keep"), reduce=reduce, keep_draws=tree.get("keep_draws"),
-        bits=tree.get("bits", "native"), run=run,
+        inputs=inputs, noise=noise, outputs=tree.get("keep"), reduce=reduce,
+        keep_draws=tree.get("keep_draws"), bits=tree.get("bits", "native"), run=run,
     )  # fmt: skip
 
 

@@ -12,6 +12,7 @@ import asyncio
 import math
 import os
 import shutil
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
@@ -30,6 +31,8 @@ from eomc.sweeps.reductions import LEAF, part_width
 
 NOT_RUN = 255
 MARK = "eomc_sweep"  # attribute of the group
+# Array of flags, each a file: the one at a digest of the worker's processor is 1.
+PROCESSORS = "processors"
 INNER_CHUNK = 1 << 16  # trajectories that a reader gets at once from a larger block
 Region = tuple[slice, ...]
 
@@ -104,7 +107,10 @@ def lay_out(
     one trajectory. Raises SweepError for reductions that are not of one number.
     """
     dims, shape = plan.dims, plan.shape
-    layouts = {"status": ArrayLayout(dims, shape, block, "uint8", NOT_RUN)}
+    layouts = {
+        "status": ArrayLayout(dims, shape, block, "uint8", NOT_RUN),
+        PROCESSORS: ArrayLayout(("digest",), (1 << 16,), (1,), "uint8", 0),
+    }
     if missing := [name for name in plan.reduce if name not in quantities]:
         there = ", ".join(quantities)
         raise SweepError(("reduce", missing[0]), f"the function returns no such name, but {there}")
@@ -195,7 +201,7 @@ def create_store(
         for name, values in coordinates.items():
             group.create_array(name, data=np.asarray(values), dimension_names=[name])
         for name, layout in layouts.items():
-            inner = _inner_chunk(layout.chunk, len(plan.shape))
+            inner = _inner_chunk(layout.chunk, min(len(plan.shape), len(layout.shape)))
             group.create_array(
                 name, shape=layout.shape, chunks=inner or layout.chunk,
                 shards=layout.chunk if inner else None, dtype=layout.dtype, fill_value=layout.fill,
@@ -267,6 +273,16 @@ class Store:
             await asyncio.gather(*writes)
 
         asyncio.run(write_all())
+
+    def mark_processor(self, processor: str) -> None:
+        """Note in the store that a processor has computed a block."""
+        k = zlib.crc32(processor.encode()) % (1 << 16)
+        if not (self.path / PROCESSORS / "c" / str(k)).exists():
+            self.write([(PROCESSORS, (slice(k, k + 1),), np.ones(1, np.uint8))])
+
+    def count_processors(self) -> int:
+        """Return the number of kinds of processors that have computed blocks."""
+        return sum(file.name.isdigit() for file in (self.path / PROCESSORS / "c").glob("*"))
 
     def grow(self, plan: Plan) -> None:
         """Make room for more draws; the blocks at the previous end are computed again.

@@ -18,7 +18,7 @@ from eomc.sweeps.axes import SweepError
 from eomc.sweeps.block import load_module, probe
 from eomc.sweeps.dataset import open_dataset
 from eomc.sweeps.engines import Execution, SweepProgress, compute_blocks
-from eomc.sweeps.plan import OutputFunction, Plan, SweepArguments, make_plan, read_scene
+from eomc.sweeps.plan import OutputFunction, Plan, Policy, SweepArguments, make_plan, read_scene
 from eomc.sweeps.store import (
     Store,
     choose_block_size,
@@ -33,7 +33,8 @@ from eomc.sweeps.store import (
 def sweep(
     scene: Any, *, over: Mapping[str, Any] | None = None, draws: Mapping[str, Any] | None = None,
     n: int | None = None, sampler: str = "random", seed: int = 0,
-    inputs: Mapping[str, float] | None = None, outputs: Any = None,
+    inputs: Mapping[str, float] | None = None, noise: Mapping[str, Any] | None = None,
+    policy: Policy | None = None, outputs: Any = None,
     reduce: Mapping[str, Any] | None = None, keep_draws: bool | None = None, bits: str = "native",
     out: str | Path | None = None, client: Any = None, threads: int | None = None,
     block: int | None = None, part: tuple[int, int] | str | None = None,
@@ -65,6 +66,12 @@ def sweep(
         Seed of the draws.
     inputs : dict, optional
         Constant values of inputs, in place of the scene's signals.
+    noise : dict, optional
+        Distribution of the noise of inputs, as in `draws`. A new value in each `control_period` is
+        added to the constant inputs, or to those of the policy.
+    policy : callable, optional
+        Function (t, q, qd) -> u of a batch, with q and qd (batch, nq) and u (batch, nu). It is
+        called at the start of each `control_period` (by default of each step).
     outputs : list of str or callable, optional
         Columns of the run whose final values are stored, or whose values at `times`, if given;
         COLUMN.max and COLUMN.min are extremes over the run, EVENT.time and EVENT.COORDINATE belong
@@ -94,7 +101,8 @@ def sweep(
     progress : callable, optional
         Called after each block with a `SweepProgress`, whose text is a line.
     **run
-        Other arguments of `simulate_batch`: duration, h, steps, every, times, tol and others.
+        Other arguments of `simulate_batch`: duration, h, steps, every, times, tol, control_period
+        and others.
 
     Returns
     -------
@@ -111,8 +119,8 @@ def sweep(
         If an argument is wrong, the store belongs to another sweep, or the sweep can't go on.
     """
     arguments = SweepArguments(
-        scene, over or {}, draws or {}, n, sampler, seed, inputs or {}, outputs, reduce or {},
-        keep_draws, bits, run,
+        scene, over or {}, draws or {}, n, sampler, seed, inputs or {}, noise or {}, policy,
+        outputs, reduce or {}, keep_draws, bits, run,
     )  # fmt: skip
     path, state = run_sweep(arguments, out, Execution(client, threads, block, part, progress))
     _warn(path, state, bool(reduce))
@@ -121,11 +129,12 @@ def sweep(
 
 @dataclass(frozen=True)
 class PreparedSweep:
-    """A checked sweep: its plan, the module of its scene, its function and its folder."""
+    """A checked sweep: its plan, the module of its scene, its functions and its folder."""
 
     plan: Plan
     model: Any
     function: OutputFunction | None
+    policy: Policy | None
     path: Path
 
     @property
@@ -151,7 +160,7 @@ def prepare_sweep(arguments: SweepArguments, out: str | Path | None) -> Prepared
     plan = make_plan(arguments, model, scene)
     function = arguments.outputs if callable(arguments.outputs) else None
     path = Path(out or f"build/sweeps/{plan.name}-{plan.digest[:12]}.zarr").absolute()
-    return PreparedSweep(plan, model, function, path)
+    return PreparedSweep(plan, model, function, arguments.policy, path)
 
 
 def run_sweep(
@@ -178,8 +187,9 @@ def run_sweep(
         numbers = [int(k) for k in np.flatnonzero(~store.finished())]
         if part is not None:
             numbers = [number for number in numbers if number % part[1] == part[0] - 1]
-        state = compute_blocks(store, numbers, execution, sweep.function)
-        state.finished = int(store.finished().sum())  # parts that run elsewhere included
+        state = compute_blocks(store, numbers, execution, (sweep.function, sweep.policy))
+        # parts that run elsewhere included
+        state.finished, state.processors = int(store.finished().sum()), store.count_processors()
         if part is None:
             store.remove_partial_files()
     return sweep.path, state
@@ -188,7 +198,7 @@ def run_sweep(
 def _create(sweep: PreparedSweep, execution: Execution, max_bytes: float) -> None:
     """Create the store of a sweep, after a probe of its first trajectories."""
     plan, threads = sweep.plan, execution.threads_of_block
-    probed = probe(sweep.model, plan, sweep.function)
+    probed = probe(sweep.model, plan, sweep.function, sweep.policy)
     size = execution.block or choose_block_size(plan, probed.seconds, threads, execution.workers)
     block = cut_block(plan, size)
     layouts = lay_out(plan, block, probed.quantities)
@@ -232,7 +242,7 @@ def _warn(path: Path, state: SweepProgress, reduces: bool) -> None:
         kinds = ", ".join(f"{n:,} {status}" for status, n in sorted(state.failures.items()))
         failed = f"{sum(state.failures.values()):,} of {state.trajectories:,}"
         lines.append(f"{failed} trajectories failed ({kinds}): see ds.status")
-    if len(state.processors) > 1:
+    if state.processors > 1:
         lines.append("workers have different processors, so last digits may differ: see bits")
     if state.finished < state.blocks:
         what = "; reductions are of these alone" if reduces else ""
