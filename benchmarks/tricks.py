@@ -36,8 +36,8 @@ import eomc
 from eomc.derive import link_multipliers
 from eomc.emit.common import adaptive, c_expression
 from eomc.emit.optimised import files, lanes
+from eomc.emit.optimised.files import Steppers
 from eomc.emit.optimised.lanes import Accelerations
-from eomc.emit.optimised.steppers import Steppers
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
 SPAN = 5.0  # s, of the runs for an error

@@ -38,7 +38,7 @@ from support.session import tiers
 
 import eomc
 from eomc.base import texts
-from eomc.cli import build, terminal
+from eomc.cli import build, options
 from eomc.cli.main import main
 from eomc.model.system import System
 from eomc.report import cost_of_digits, page, plot
@@ -206,20 +206,20 @@ def test_commands_escape_all_texts(work_folder: Path) -> None:
 
 
 def test_only_the_terminal_module_prints() -> None:
-    for file in Path(terminal.__file__).parent.glob("*.py"):
+    for file in Path(options.__file__).parent.glob("*.py"):
         source = file.read_text(encoding="utf-8")
-        assert source.count("click.echo(") == 2 * (file.name == "terminal.py")
+        assert source.count("click.echo(") == 2 * (file.name == "options.py")
         assert not re.search(r"^\s*print\(", source, re.M)
 
 
 TERMINAL = """
 import time
-from eomc.cli import terminal
-with terminal.status_line({given!r}, False):
+from eomc.cli import options
+with options.status_line({given!r}, False):
     time.sleep(0.2)
 times = iter(range(0, 1000, 10))
-terminal.time.monotonic = lambda: next(times)
-with terminal.progress_bar({given!r}, False) as progress:
+options.time.monotonic = lambda: next(times)
+with options.progress_bar({given!r}, False) as progress:
     progress(0, 2)
     progress(1, 2)
 """

@@ -15,7 +15,7 @@ from support.cases import cases, scene_file, scene_text, variant
 from support.session import tiers
 
 import eomc
-from eomc.emit.common import coefficients
+from eomc.emit.common import solver
 from eomc.emit.common.c_expression import DOUBLE, FLOAT, Real
 from eomc.integrators import tableaux
 from eomc.integrators.tableaux import DP8, METHODS, Method
@@ -75,7 +75,7 @@ def test_rounded_weights_add_up_to_one(method: Method, real: Real) -> None:
     """Each weight is a number of C's type; its error is at most that of rounding them
     separately.
     """
-    rounded = coefficients.round_weights(method.b, real)
+    rounded = solver.round_weights(method.b, real)
     kind = np.dtype(real.dtype).type
     assert [Fraction(float(kind(float(x)))) for x in rounded] == list(rounded)
     assert sum(rounded) == 1

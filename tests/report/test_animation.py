@@ -14,9 +14,8 @@ from support import trajectories
 
 from eomc.base.errors import EomcError
 from eomc.report import animation
-from eomc.report.drawing import draw_mechanism
-from eomc.report.style import html_name
-from eomc.report.timeline import Timeline, choose_instances, find_system
+from eomc.report.drawing import Timeline, choose_instances, draw_mechanism, find_system
+from eomc.report.plot import html_name
 
 EVIL = "</script><img src=x onerror=alert(1)>"
 
@@ -285,9 +284,9 @@ def test_batch_is_written_as_a_film(batch, tmp_path):
 
 
 def film(model, file, **how):
-    from eomc.report import film
+    from eomc.report import animation
 
-    film.write_film([Timeline(system(model), motion(model, **how))], file, None)
+    animation.write_film([Timeline(system(model), motion(model, **how))], file, None)
 
 
 @pytest.mark.slow
@@ -307,7 +306,7 @@ def test_gif_has_a_frame_for_each_instant(tmp_path):
 
 def test_film_draws_fixed_parts_once_and_fits_all_in_view(monkeypatch):
     matplotlib = pytest.importorskip("matplotlib")
-    from eomc.report.film import Pictures
+    from eomc.report.animation import Pictures
 
     drawn, draw = [], matplotlib.axis.Axis.draw
     monkeypatch.setattr(
@@ -346,7 +345,7 @@ def test_failed_films_report_the_reason(tmp_path, monkeypatch):
         film(scene("cartpole"), tmp_path / "a.gif", seconds=1000.0)
     bare = system(scene("cartpole"))
     bare.scene, bare.definitions = None, ()
-    from eomc.report.film import write_film
+    from eomc.report.animation import write_film
 
     with pytest.raises(EomcError, match="says nothing about its shape"):
         write_film([Timeline(bare, motion(scene("cartpole")))], tmp_path / "a.gif", None)

@@ -11,7 +11,7 @@ from report.pictures import chain, humanoid, motion, scene, system
 from support import browser, trajectories
 
 from eomc.report import animation
-from eomc.report.timeline import BatchTimeline, Timeline, find_system
+from eomc.report.drawing import BatchTimeline, Timeline, find_system
 
 pytestmark = [
     pytest.mark.slow,

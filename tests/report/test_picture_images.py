@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from report.pictures import motion, scene, system
 
-from eomc.report import picture
+from eomc.report import plot
 from eomc.report.drawing import draw_mechanism
 
 pytest.importorskip("matplotlib")
@@ -25,13 +25,13 @@ def render_image(drawing):
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    flat = picture.project_points(drawing)
+    flat = plot.project_points(drawing)
     figure = Figure(figsize=(2, 2), dpi=SIZE / 2)
     canvas = FigureCanvasAgg(figure)
     axes = figure.add_axes((0, 0, 1, 1))
     for path in drawing.paths:
         axes.plot(*flat[:, path.point].T, linewidth=1.0)
-    picture.draw_marks(axes, drawing, flat[-1])
+    plot.draw_marks(axes, drawing, flat[-1])
     axes.update_datalim(flat.reshape(-1, 2))
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_axis_off()

@@ -118,7 +118,7 @@ def test_batch_split_into_several_calls_is_identical(monkeypatch: pytest.MonkeyP
 
     reference = simulate_all()
     for name in ("FIRST_POLL_SECONDS", "POLL_SECONDS"):
-        monkeypatch.setattr(sys.modules[f"{m.__name__}._runtime.batch_integration"], name, 0.0)
+        monkeypatch.setattr(sys.modules[f"{m.__name__}._runtime.batch"], name, 0.0)
     for expected, actual in zip(reference, simulate_all(), strict=True):
         for name in ("t", "q", "qd", "steps"):
             assert np.array_equal(getattr(expected, name), getattr(actual, name), equal_nan=True)

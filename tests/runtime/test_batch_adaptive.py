@@ -78,9 +78,7 @@ def test_batch_split_into_several_calls_is_identical(
     """For any number of steps per call and any group size per thread."""
     options = {"tol": 1e-10, "times": np.linspace(0.1, 40.0, 30)}
     run = orbits.simulate_batch(*starts(21), **options)
-    module = __import__(
-        f"{orbits.__name__}._runtime.batch_integration", fromlist=["batch_integration"]
-    )
+    module = __import__(f"{orbits.__name__}._runtime.batch", fromlist=["batch"])
     monkeypatch.setattr(module, "next_chunk", lambda many, spent: many)
     for chunk_steps, group in ((1, 16), (7, 5), (64, 128)):
         monkeypatch.setattr(module, "FIRST_CHUNK_STEPS", chunk_steps)

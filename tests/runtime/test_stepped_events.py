@@ -18,7 +18,7 @@ from support.session import Modules
 
 import eomc
 from eomc.model.system import from_scene
-from eomc.runtime import section
+from eomc.runtime import trajectory
 from eomc.runtime.package import model_of
 from eomc.scene.read import parse
 
@@ -568,10 +568,10 @@ def test_section_at_rest_is_crossed_once_when_left_to_the_other_side(
         "v": np.concatenate([1 - piece + rest, rest, slope * piece]),
     }
     for level, period in ((0.0, None), (0.0, 10.0), (-10.0, 10.0)):
-        crossings = section.crossings(columns, "v", level, None, period)
+        crossings = trajectory.crossings(columns, "v", level, None, period)
         assert crossings["t"] == pytest.approx([2.0] if slope < 0 else [])
     with_nan = columns | {"v": np.where(columns["t"] < 0.5, np.nan, columns["v"] - 0.3)}
-    assert len(section.crossings(with_nan, "v", 0.0, False, None)["t"]) == 1
+    assert len(trajectory.crossings(with_nan, "v", 0.0, False, None)["t"]) == 1
 
 
 def test_run_that_ends_before_its_first_row_has_no_values(ball: ModuleType) -> None:

@@ -11,8 +11,7 @@ import numpy as np
 from sympy import Expr
 
 from eomc.model.system import System
-from eomc.verify.symbolic import SymbolicReference
-from eomc.verify.trig_simplify import simplify_trig
+from eomc.verify.symbolic import SymbolicReference, simplify_trig
 
 
 def simplify_reference(reference: SymbolicReference) -> SymbolicReference:

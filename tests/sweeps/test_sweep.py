@@ -17,7 +17,7 @@ from support.sweep_scene import DRAWS, SCENE, SWEEP, are_equal
 
 import eomc
 from eomc.base.errors import EomcError
-from eomc.sweeps import axes, block, reductions
+from eomc.sweeps import block, plan, store
 from eomc.sweeps.store import NOT_RUN, Store, hold_store
 from eomc.sweeps.sweep import sweep
 
@@ -48,28 +48,28 @@ batch    = true
 # --- values by index ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("sampler", axes.SAMPLERS)
+@pytest.mark.parametrize("sampler", plan.SAMPLERS)
 def test_values_depend_on_seed_name_and_index_alone(sampler: str) -> None:
-    draws = {name: axes.read_distribution((name,), x) for name, x in DRAWS.items()}
-    whole = axes.draw_values(draws, (sampler, 3, 1000), 0, 1000)
+    draws = {name: plan.read_distribution((name,), x) for name, x in DRAWS.items()}
+    whole = plan.draw_values(draws, (sampler, 3, 1000), 0, 1000)
     for start, stop in ((37, 501), (0, 5), (501, 1000)):
-        part = axes.draw_values(draws, (sampler, 3, 1000), start, stop)
+        part = plan.draw_values(draws, (sampler, 3, 1000), start, stop)
         assert all(np.array_equal(part[name], x[start:stop]) for name, x in whole.items())
-    other = axes.draw_values(draws, (sampler, 4, 1000), 0, 1000)
+    other = plan.draw_values(draws, (sampler, 4, 1000), 0, 1000)
     assert not np.array_equal(whole["m"], other["m"])
 
 
 @pytest.mark.parametrize("sampler", ["random", "sobol"])
 def test_a_longer_sweep_begins_with_the_shorter_one(sampler: str) -> None:
-    draws = {name: axes.read_distribution((name,), x) for name, x in DRAWS.items()}
-    short, long = (axes.draw_values(draws, (sampler, 0, n), 0, n) for n in (300, 700))
+    draws = {name: plan.read_distribution((name,), x) for name, x in DRAWS.items()}
+    short, long = (plan.draw_values(draws, (sampler, 0, n), 0, n) for n in (300, 700))
     assert all(np.array_equal(x, long[name][:300]) for name, x in short.items())
 
 
 def test_another_draw_changes_no_random_draw() -> None:
-    m = axes.read_distribution(("m",), {"normal": [2, 0.1]})
-    one = axes.draw_values({"m": m}, ("random", 0, 50), 0, 50)
-    two = axes.draw_values({"l": {"uniform": [1, 2]}, "m": m}, ("random", 0, 50), 0, 50)
+    m = plan.read_distribution(("m",), {"normal": [2, 0.1]})
+    one = plan.draw_values({"m": m}, ("random", 0, 50), 0, 50)
+    two = plan.draw_values({"l": {"uniform": [1, 2]}, "m": m}, ("random", 0, 50), 0, 50)
     assert np.array_equal(one["m"], two["m"])
 
 
@@ -86,12 +86,12 @@ def test_another_draw_changes_no_random_draw() -> None:
 def test_distributions_are_those_of_scipy(distribution: Any, oracle: tuple[Any, ...]) -> None:
     from scipy import stats
 
-    u = axes.random_uniforms(0, "m", 0, 2000)
+    u = plan.random_uniforms(0, "m", 0, 2000)
     frozen = getattr(stats, oracle[0])(*oracle[1:])
-    own = axes.inverse_cdf(axes.read_distribution(("m",), distribution), u)
+    own = plan.inverse_cdf(plan.read_distribution(("m",), distribution), u)
     assert np.allclose(own, frozen.ppf(u), rtol=1e-9, atol=1e-12)
     assert np.array_equal(
-        axes.inverse_cdf(axes.read_distribution(("m",), frozen), u), frozen.ppf(u)
+        plan.inverse_cdf(plan.read_distribution(("m",), frozen), u), frozen.ppf(u)
     )
 
 
@@ -137,8 +137,8 @@ def test_reductions_depend_on_no_block(scene: Path, tmp_path: Path) -> None:
 
 def test_moments_leave_out_what_is_not_finite() -> None:
     x = np.array([[1.0, np.nan, 3.0, np.inf], [np.nan] * 4])
-    part = reductions.part_of_block("mean", [], x)[:, None]
-    merged = reductions.merge("mean", [], part)
+    part = store.part_of_block("mean", [], x)[:, None]
+    merged = store.merge("mean", [], part)
     assert merged["count"].tolist() == [2, 0]
     assert merged["mean"][0] == 2 and merged["std"][0] == np.sqrt(2)
     assert np.isnan(merged["mean"][1]) and np.isnan(merged["std"][1])
@@ -368,8 +368,8 @@ def test_noise_depends_on_the_index_alone(scene: Path, tmp_path: Path) -> None:
     one = sweep(scene, draws=draws, n=600, block=256, **NOISE, out=tmp_path / "a.zarr")
     two = sweep(scene, over={"m": [1.0, 2.0]}, draws=draws, n=600, **NOISE, out=tmp_path / "b.zarr")
     assert np.array_equal(one["theta"].values, two["theta"].values[0])  # the scene has m = 1
-    uniforms = axes.random_uniforms(0, "noise torque", 0, 4 * 600).reshape(600, 4)
-    noise = axes.inverse_cdf({"normal": [0.0, 0.5]}, uniforms)
+    uniforms = plan.random_uniforms(0, "noise torque", 0, 4 * 600).reshape(600, 4)
+    noise = plan.inverse_cdf({"normal": [0.0, 0.5]}, uniforms)
     starts = {"theta": one["theta_start"].values}
     runs = eomc.load(scene).simulate_batch(starts, u={"torque": noise}, control_period=0.05)
     assert np.array_equal(one["theta"].values, runs.q[:, -1, 0])

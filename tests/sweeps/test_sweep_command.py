@@ -15,8 +15,7 @@ from support.session import ROOT
 from support.sweep_scene import DRAWS, SCENE, are_equal
 
 from eomc.cli.main import main
-from eomc.sweeps.dataset import draw_plot, open_dataset
-from eomc.sweeps.store import Store
+from eomc.sweeps.store import Store, draw_plot, open_dataset
 from eomc.sweeps.sweep import sweep
 
 pytest.importorskip("zarr")

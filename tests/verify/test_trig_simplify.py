@@ -6,7 +6,7 @@ import pytest
 import sympy
 from sympy import cos, sin, sqrt, symbols
 
-from eomc.verify.trig_simplify import coefficients, simplify_trig
+from eomc.verify.symbolic import coefficients, simplify_trig
 
 a, b, x, r, m, k = symbols("a b x r m k", real=True)
 v, w = symbols("v w", real=True)

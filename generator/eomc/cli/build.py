@@ -12,7 +12,7 @@ import click
 from eomc import pipeline
 from eomc.base.errors import EomcError
 from eomc.cli import options
-from eomc.cli.terminal import escape_line, say, status_line, warn
+from eomc.cli.options import escape_line, say, status_line, warn
 
 
 @click.command("build")

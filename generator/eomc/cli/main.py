@@ -16,18 +16,18 @@ import click
 from eomc.base import texts
 from eomc.base.errors import EomcError, FolderError, SceneError
 from eomc.base.resources import __version__
-from eomc.cli import terminal
-from eomc.cli.terminal import fail, say
+from eomc.cli import options
+from eomc.cli.options import fail, say
 
 # name of each command, and the module with the function <name>_command
 COMMANDS = {
-    "build": "build", "check": "comparison", "dof": "description", "export": "build",
-    "import": "scenes", "list": "scenes", "new": "scenes", "report": "comparison", "run": "run",
-    "schema": "scenes", "show": "description", "sweep": "sweep",
+    "build": "build", "check": "inspection", "dof": "inspection", "export": "build",
+    "import": "scenes", "list": "scenes", "new": "scenes", "report": "inspection", "run": "run",
+    "schema": "scenes", "show": "inspection", "sweep": "sweep",
 }  # fmt: skip
 
 
-class _Group(terminal.CommandGroup):
+class _Group(options.CommandGroup):
     """Prints errors that the user can correct without a traceback, with exit status 2."""
 
     def list_commands(self, context: click.Context) -> list[str]:

@@ -19,8 +19,7 @@ from eomc import pipeline
 from eomc.base import texts
 from eomc.base.errors import EomcError, writing
 from eomc.cli import options
-from eomc.cli.options import parse_pairs
-from eomc.cli.terminal import escape_line, progress_bar, say, status_line, warn
+from eomc.cli.options import escape_line, parse_pairs, progress_bar, say, status_line, warn
 from eomc.runtime.package import model_of
 
 if TYPE_CHECKING:

@@ -15,8 +15,7 @@ from eomc import pipeline
 from eomc.base import resources, texts
 from eomc.base.errors import EomcError, NoCompilerError
 from eomc.cli import options
-from eomc.cli.options import parse_pairs
-from eomc.cli.terminal import escape_line, say
+from eomc.cli.options import escape_line, parse_pairs, say
 
 if TYPE_CHECKING:
     from eomc.robots.robot import Robot

@@ -16,7 +16,7 @@ import click
 
 from eomc.base.errors import EomcError
 from eomc.cli import options
-from eomc.cli.terminal import escape_line, progress_bar, say
+from eomc.cli.options import escape_line, progress_bar, say
 
 if TYPE_CHECKING:
     from eomc.sweeps.engines import SweepProgress
@@ -59,8 +59,7 @@ def sweep_command(command: SimpleNamespace) -> None:
     eomc sweep basin.toml --plot basin.png
     eomc sweep scene.toml --over m_p=1:3:100 --draw l=normal:2,0.1 --n 10_000
     """
-    from eomc.sweeps.axes import SweepError
-    from eomc.sweeps.plan import place_error, read_file
+    from eomc.sweeps.plan import SweepError, place_error, read_file
 
     arguments, places = read_file(command.file)
     try:
@@ -115,7 +114,7 @@ def _read_draw(option: str) -> tuple[str, dict[str, list[float]]]:
 
 def _run(command: SimpleNamespace, arguments: SweepArguments) -> None:
     """Run a sweep, or print its status; then draw, export and print what the options name."""
-    from eomc.sweeps import dataset
+    from eomc.sweeps import store
     from eomc.sweeps.engines import Execution
     from eomc.sweeps.sweep import prepare_sweep, run_sweep
 
@@ -135,9 +134,9 @@ def _run(command: SimpleNamespace, arguments: SweepArguments) -> None:
         max_bytes = math.inf if command.yes else MAX_BYTES
         path, state = run_sweep(arguments, command.out, execution, max_bytes)
     if command.plot is not None:
-        dataset.draw_plot(path, command.plot)
+        store.draw_plot(path, command.plot)
     if command.parquet is not None:
-        dataset.write_parquet(path, command.parquet)
+        store.write_parquet(path, command.parquet)
     _print_end(command, path, state)
     sys.exit(1 if state.excluded else 0)
 

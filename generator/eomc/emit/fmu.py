@@ -18,9 +18,9 @@ from sympy import Symbol
 from eomc.base import resources
 from eomc.base.texts import FreeText
 from eomc.derive.tape import Stage, Tape
+from eomc.emit.common.adaptive import DIRECTIONS
 from eomc.emit.common.c_function import break_long_lines
 from eomc.emit.common.c_names import Target
-from eomc.emit.common.events import DIRECTIONS
 from eomc.emit.common.functions import SceneFunctions
 from eomc.emit.common.templates import show
 from eomc.model.algebra import expression

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from eomc.emit.common import adaptive, projection, solver
+from eomc.emit.common import adaptive, solver
 from eomc.emit.common import c_function as c
 from eomc.emit.common.c_expression import Real
 from eomc.emit.common.c_function import CArgument, CFunction
-from eomc.emit.common.derivatives import step_derivatives
 from eomc.emit.common.functions import SceneFunctions, portable_functions
-from eomc.emit.common.solver import SolverModel
+from eomc.emit.common.solver import SolverModel, step_derivatives
 from eomc.emit.common.templates import show
 from eomc.integrators.tableaux import RK4, Method
 from eomc.program.program import Program
@@ -27,7 +26,7 @@ def files(
     functions = portable_functions(program, real, written)
     name = functions.prefix
     model = solver.portable_model(functions)
-    texts = [*projection.step_source(model), *projection.state_source(model)]
+    texts = [*solver.projected_step_source(model), *solver.state_source(model)]
     for m in functions.methods:
         texts += [*(solver.step_source(model, m) if m is not RK4 else ()), step(model, m)]
     texts += [*step_derivatives(model), *_runs(model)]
@@ -45,7 +44,7 @@ def step(model: SolverModel, m: Method) -> str:
     shared = {"model": model, "method": m, "advance": advance}
     if m is not RK4:
         return show("c/portable/step.c", model.functions, **shared)
-    correct = projection.project_end(model, "r", "v", "q", "t + h") if advance.qualifier else ""
+    correct = solver.project_end(model, "r", "v", "q", "t + h") if advance.qualifier else ""
     return show("c/portable/rk4.c", model.functions, **shared, correct=correct)
 
 

@@ -34,7 +34,7 @@ from eomc.report.typeset import (
 )
 from eomc.scene.formulas import suggest
 from eomc.verify import symbolic
-from eomc.verify.trig_simplify import coefficients, simplify_trig
+from eomc.verify.symbolic import coefficients, simplify_trig
 
 Terms = list[tuple[Expr, Expr]]  # a product of accelerations or rates, and its coefficient
 

@@ -25,8 +25,7 @@ from eomc.report.cost_of_digits import (
     WorkPrecisionReport,
     build_variant,
 )
-from eomc.report.plot import make_figure, to_svg, without_pictures
-from eomc.report.style import html_name
+from eomc.report.plot import html_name, make_figure, to_svg, without_pictures
 from eomc.report.typeset import write_mathml
 
 Row = tuple[Markup, str, Markup, Markup]  # name, value, unit, note
@@ -378,7 +377,7 @@ def _svg(draw: Callable[[Any], None], size: tuple[float, float]) -> Markup:
 
 
 def _styles(report: WorkPrecisionReport) -> dict[str, tuple[str, str]]:
-    from eomc.report.style import COLOURS, INK
+    from eomc.report.plot import COLOURS, INK
 
     colours = (*COLOURS, INK, "#999999")
     marks = "osD^vPX*"

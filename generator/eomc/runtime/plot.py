@@ -464,6 +464,6 @@ def _picture(run: Any) -> str:
 def _mechanism(run: Any) -> Any:
     """Return the object that draws the mechanism of a run; None without eomc or shapes."""
     try:
-        return require_eomc("report.picture").of_run(run)
+        return require_eomc("report.plot").of_run(run)
     except ImportError:
         return None

@@ -22,10 +22,18 @@ from typing import Any
 import numpy as np
 
 from eomc.base.errors import EomcError
-from eomc.sweeps.axes import Array, SweepError, draw_values, inverse_cdf, random_uniforms
-from eomc.sweeps.plan import OVER_ROWS, OutputFunction, Plan, Policy
-from eomc.sweeps.reductions import part_of_block
-from eomc.sweeps.store import Region, Store, open_store, part_name
+from eomc.sweeps.plan import (
+    OVER_ROWS,
+    Array,
+    OutputFunction,
+    Plan,
+    Policy,
+    SweepError,
+    draw_values,
+    inverse_cdf,
+    random_uniforms,
+)
+from eomc.sweeps.store import Region, Store, open_store, part_name, part_of_block
 
 # A call of simulate_batch takes so many instances, whose states then fit in the cache, and so many
 # bytes of rows, and of noise, which is read once and should stay in the cache.

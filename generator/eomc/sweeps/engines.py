@@ -33,9 +33,8 @@ from typing import Any
 
 from eomc.base import texts
 from eomc.base.errors import EomcError
-from eomc.sweeps.axes import SweepError
 from eomc.sweeps.block import BlockReport, Task, ignore_failures, process_name, run_block
-from eomc.sweeps.plan import OutputFunction, Policy
+from eomc.sweeps.plan import OutputFunction, Policy, SweepError
 from eomc.sweeps.store import Store
 
 Functions = tuple[OutputFunction | None, Policy | None]

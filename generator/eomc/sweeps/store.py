@@ -3,7 +3,16 @@
 A block is one chunk (or one shard) of every array, so that no two tasks write the same file, and
 Zarr writes each file under a temporary name. A block is finished if its chunk of `status` exists,
 which is written last. The fill value of `status` is NOT_RUN, since Zarr writes no chunk that is
-equal to the fill value.
+equal to the fill value. `open_dataset` reads a store lazily.
+
+The parts of reductions over draws that blocks store merge to the same bits in any order. Moments
+are merged as a binary tree over leaves of LEAF trajectories, so a block of LEAF times a power of
+two is a subtree. Histograms and the counts for quantiles are integers.
+
+References
+----------
+Chan, Golub, LeVeque: Updating formulae and a pairwise algorithm for computing sample variances
+(1979), for the merging of moments.
 """
 
 from __future__ import annotations
@@ -24,10 +33,116 @@ from uuid import uuid4
 import numpy as np
 
 from eomc.base import texts
-from eomc.base.errors import EomcError
-from eomc.sweeps.axes import Array, SweepError
-from eomc.sweeps.plan import Plan
-from eomc.sweeps.reductions import LEAF, part_width
+from eomc.base.errors import EomcError, writing
+from eomc.sweeps.plan import Array, Plan, SweepError
+
+LEAF = 256  # trajectories
+# Quantiles count values by sign, exponent and seven bits of the fraction: 0.4 % wide bins from
+# 2**-64 to 2**64. Smaller values count as 0, larger ones as the largest bin.
+FRACTION_SHIFT = 45
+LOWEST_KEY = (1023 - 64) << 7
+HALF_BINS = 128 << 7
+
+
+def part_width(kind: str, numbers: Sequence[float]) -> int:
+    """Return the number of values that a block stores of a reduction."""
+    return {"mean": 3, "histogram": len(numbers) - 1, "quantile": 2 * HALF_BINS}[kind]
+
+
+def part_of_block(kind: str, numbers: Sequence[float], x: Array) -> Array:
+    """Return the part (..., width) of a reduction, for values (..., n) of a block's draws.
+
+    Values that are not finite are left out.
+    """
+    if kind == "mean":
+        return _moments(x)
+    rows = np.ascontiguousarray(x, float).reshape(-1, x.shape[-1])
+    if kind == "histogram":
+        parts = [np.histogram(row[np.isfinite(row)], numbers)[0] for row in rows]
+    else:
+        parts = [np.bincount(_bins(row[np.isfinite(row)]), minlength=2 * HALF_BINS) for row in rows]
+    return np.stack(parts).reshape(*x.shape[:-1], -1)
+
+
+def merge(kind: str, numbers: Sequence[float], parts: Any) -> dict[str, Array]:
+    """Merge the parts (..., blocks, width) of all blocks; return the results by their endings."""
+    if kind == "mean":
+        count, mean, squares = np.moveaxis(_merge_tree(np.moveaxis(parts[...], -2, 0)), -1, 0)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            deviation = np.sqrt(squares / (count - 1))
+        mean = np.where(count > 0, mean, np.nan)
+        return {
+            "count": count.astype(int),
+            "mean": mean,
+            "std": np.where(count > 1, deviation, np.nan),
+        }
+    total = sum(parts[..., k, :] for k in range(parts.shape[-2]))
+    return {kind: total if kind == "histogram" else _quantiles(total, numbers)}
+
+
+# --- moments --------------------------------------------------------------------------------------
+
+
+def _moments(x: Array) -> Array:
+    """Return number, mean and sum of squared deviations (..., 3) of the finite values (..., n)."""
+    missing = -x.shape[-1] % LEAF
+    x = np.concatenate([x, np.full((*x.shape[:-1], missing), np.nan)], -1)
+    # NumPy adds in another order along axes that are not contiguous
+    x = np.ascontiguousarray(x, float).reshape(*x.shape[:-1], -1, LEAF)
+    finite = np.isfinite(x)
+    count = finite.sum(-1).astype(float)
+    mean = np.where(finite, x, 0.0).sum(-1) / np.maximum(count, 1)
+    deviations = np.where(finite, x - mean[..., None], 0.0)
+    leaves = np.stack([count, mean, (deviations * deviations).sum(-1)], -1)
+    return _merge_tree(np.moveaxis(leaves, -2, 0))
+
+
+def _merge_tree(parts: Array) -> Array:
+    """Merge neighbours (m, ..., 3) until one is left, (..., 3)."""
+    while len(parts) > 1:
+        if len(parts) % 2:
+            parts = np.concatenate([parts, np.zeros((1, *parts.shape[1:]))])
+        parts = _merge_pair(parts[0::2], parts[1::2])
+    return np.asarray(parts[0])
+
+
+def _merge_pair(a: Array, b: Array) -> Array:
+    """Merge moments (..., 3) of two disjoint sets; an empty set changes no bit of the other."""
+    (n, mean, squares), (m, other_mean, other_squares) = (
+        np.moveaxis(a, -1, 0),
+        np.moveaxis(b, -1, 0),
+    )
+    total = n + m
+    weight = m / np.maximum(total, 1)
+    step = other_mean - mean
+    merged = [total, mean + step * weight, squares + other_squares + step * step * n * weight]
+    return np.stack(merged, -1)
+
+
+# --- quantiles ------------------------------------------------------------------------------------
+
+
+def _bins(x: Array) -> Array:
+    """Return the index of the bin of each value; indices ascend with the values."""
+    keys = (np.abs(x).view(np.int64) >> FRACTION_SHIFT) - LOWEST_KEY
+    keys = np.clip(keys, 0, HALF_BINS - 1)
+    return np.asarray(np.where(x < 0, HALF_BINS - 1 - keys, HALF_BINS + keys))
+
+
+def _quantiles(counts: Array, probabilities: Sequence[float]) -> Array:
+    """Return quantiles (..., probabilities) from counts (..., bins): the middle of the bin."""
+    totals = np.cumsum(counts, -1)
+    ranks = np.asarray(probabilities) * (totals[..., -1:] - 1)
+    rows = zip(
+        totals.reshape(-1, totals.shape[-1]), ranks.reshape(-1, ranks.shape[-1]), strict=True
+    )
+    bins = np.array([np.searchsorted(row, rank, side="right") for row, rank in rows])
+    keys = np.where(bins < HALF_BINS, HALF_BINS - 1 - bins, bins - HALF_BINS)
+    lower = ((keys + LOWEST_KEY) << FRACTION_SHIFT).view(float)
+    upper = ((keys + LOWEST_KEY + 1) << FRACTION_SHIFT).view(float)
+    values = np.where(keys == 0, 0.0, (lower + upper) / 2) * np.where(bins < HALF_BINS, -1, 1)
+    return np.where(totals[..., -1:] > 0, values.reshape(ranks.shape), np.nan)
+
 
 NOT_RUN = 255
 MARK = "eomc_sweep"  # attribute of the group
@@ -321,3 +436,110 @@ def open_store(path: str, stamp: str) -> Store:
     if store.stamp != stamp:
         raise SweepError((), f"{texts.line(path)}: was replaced while the sweep ran")
     return store
+
+
+def open_dataset(path: Path) -> Any:
+    """Return the `xarray.Dataset` of a store."""
+    import xarray
+
+    store = Store(path)
+    plan = store.plan
+    dataset = xarray.open_zarr(str(path), consolidated=False, mask_and_scale=False, chunks=None)
+    dataset = dataset.drop_vars(PROCESSORS)
+    dataset.attrs = {"scene": plan.name, "seed": plan.seed, "sampler": plan.sampler}
+    outer = plan.dims[:-1]
+    for name, reductions in plan.reduce.items():
+        for kind, numbers in reductions:
+            parts = part_name(name, kind)
+            dataset = dataset.drop_vars(parts)
+            for ending, values in merge(kind, numbers, store.group[parts]).items():
+                dims, coordinates = outer, {}
+                if kind == "histogram":
+                    middle = (np.asarray(numbers[1:]) + numbers[:-1]) / 2
+                    dims, coordinates = (*outer, f"{name}_bin"), {f"{name}_bin": middle}
+                elif kind == "quantile":
+                    dims = (*outer, f"{name}_probability")
+                    coordinates = {f"{name}_probability": numbers}
+                dataset = dataset.assign_coords(coordinates)
+                dataset[f"{name}_{ending}"] = (dims, values)
+    return dataset
+
+
+def write_parquet(path: Path, folder: Path) -> None:
+    """Write the stored quantities of each finished block to a Parquet file.
+
+    A file has a row for each trajectory, with its axes and values. Raises EomcError if the packages
+    for that are missing, or a file can't be written.
+    """
+    store = Store(path)
+    if store.plan.reduce:
+        raise EomcError("Parquet files have a row for each trajectory: leave out the reductions")
+    with writing(texts.line(str(folder))):
+        dataset = open_dataset(path)
+        folder.mkdir(parents=True, exist_ok=True)
+        for number in np.flatnonzero(store.finished()):
+            region = dict(zip(store.plan.dims, store.place(int(number))[1], strict=True))
+            rows = dataset.isel(region).to_dataframe().reset_index()
+            if store.plan.draws:
+                rows["draw"] += region["draw"].start
+            try:
+                rows.to_parquet(folder / f"block-{number:06d}.parquet", index=False)
+            except ImportError:
+                raise EomcError("Parquet files need pyarrow: pip install pyarrow") from None
+
+
+def draw_plot(path: Path, file: Path) -> None:
+    """Plot the first quantity of a store: a curve, a map, or a histogram, according to the shape.
+
+    Of the results of a function, the first in alphabetical order is drawn.
+
+    One axis gives a curve, or points if the quantity has several values; two axes give a map. Draws
+    without an axis give a histogram with quantiles, and with axes their mean. Raises EomcError for
+    more axes, and without matplotlib.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise EomcError("drawing needs matplotlib: pip install matplotlib") from None
+    store, dataset = Store(path), open_dataset(path)
+    plan, finished = store.plan, int(store.finished().sum())
+    endings = [f"{name}_{kind}" for name, kinds in plan.reduce.items() for kind, _ in kinds]
+    varied = {"status", *map(plan.label, plan.draws)}
+    names = [*plan.outputs, *endings, *sorted({*dataset.data_vars} - varied), "status"]
+    name = next(name for name in names if name in dataset)
+    values = dataset[name].squeeze()
+    axes = [dim for dim in plan.dims[: len(plan.over)] if dim in values.dims]
+    if len(axes) > 2:
+        raise EomcError(f"a plot has at most two axes, and this sweep has {', '.join(axes)}")
+    ax = (figure := Figure(layout="constrained")).subplots()
+    if "draw" in values.dims and axes:
+        values = values.mean("draw")
+    if len(axes) == 2:
+        values = values.isel({d: -1 for d in values.dims if d not in axes})
+        image = ax.pcolormesh(*(dataset[x] for x in axes), values.transpose(*axes[::-1]))
+        figure.colorbar(image, label=name)
+        ax.set(xlabel=axes[0], ylabel=axes[1])
+    elif axes:
+        y = values.transpose(axes[0], ...).values.reshape(len(dataset[axes[0]]), -1)
+        ax.plot(dataset[axes[0]], y, *(["k,"] if y.shape[1] > 1 else []))
+        ax.set(xlabel=axes[0], ylabel=name)
+    else:
+        _draw_histogram(ax, values, name)
+    if finished < store.blocks:
+        ax.set_title(f"{finished} of {store.blocks} blocks")
+    with writing(texts.line(str(file))):
+        figure.savefig(file)
+
+
+def _draw_histogram(ax: Any, values: Any, name: str) -> None:
+    """Draw a histogram of values, or the stored one, with the quantiles of 5, 50 and 95 %."""
+    if name.endswith("_histogram"):
+        (dimension,) = values.dims
+        ax.step(values[dimension], values, where="mid")
+        name = name.removesuffix("_histogram")
+    else:
+        x = values.values[np.isfinite(values.values)]
+        ax.hist(x, bins=100)
+        for probability in (0.05, 0.5, 0.95) if len(x) else ():
+            ax.axvline(np.quantile(x, probability), color="k", linewidth=0.8)
+    ax.set(xlabel=name, ylabel="trajectories")

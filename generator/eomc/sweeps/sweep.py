@@ -14,11 +14,17 @@ import numpy as np
 
 from eomc.base import texts
 from eomc.base.errors import EomcError, writing
-from eomc.sweeps.axes import SweepError
 from eomc.sweeps.block import load_module, probe
-from eomc.sweeps.dataset import open_dataset
 from eomc.sweeps.engines import Execution, SweepProgress, compute_blocks
-from eomc.sweeps.plan import OutputFunction, Plan, Policy, SweepArguments, make_plan, read_scene
+from eomc.sweeps.plan import (
+    OutputFunction,
+    Plan,
+    Policy,
+    SweepArguments,
+    SweepError,
+    make_plan,
+    read_scene,
+)
 from eomc.sweeps.store import (
     Store,
     choose_block_size,
@@ -26,6 +32,7 @@ from eomc.sweeps.store import (
     cut_block,
     hold_store,
     lay_out,
+    open_dataset,
     read_plan,
 )
 

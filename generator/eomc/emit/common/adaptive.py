@@ -1,21 +1,23 @@
-"""Adaptive steps in both forms of C, portable and optimised: the library's part, and its glue."""
+"""Adaptive steps and events in both forms of C: the library's part, its tables, and its glue."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from fractions import Fraction
+from math import cos, pi
 
-from eomc.emit.common import events, solver
+from eomc.emit.common import c_function as c
+from eomc.emit.common import solver
 from eomc.emit.common.amalgamate import Names, amalgamate
 from eomc.emit.common.c_names import Target
-from eomc.emit.common.coefficients import c_matrix, round_weights
 from eomc.emit.common.functions import SceneFunctions
-from eomc.emit.common.solver import SolverModel
+from eomc.emit.common.solver import SolverModel, c_matrix, c_vector, round_weights
 from eomc.emit.common.templates import show
 from eomc.integrators.tableaux import GAUSS16, Row
 from eomc.model.mechanics import has_steep_terms
 from eomc.model.system import System
 from eomc.program import outline
+from eomc.scene.schema import ACTIONS
 from eomc.scene.value_types import MAX_TOLERANCE
 
 METHOD = GAUSS16
@@ -112,7 +114,7 @@ def library_names(model: SolverModel) -> Names:
         "EOM_LONGEST": target.literal(MAX_TIME_SCALES),
         "EOM_REPEATED_KINKS": target.literal(float(f"{real.epsilon ** (-1 / 3):.0e}")),
         "EOM_POWERS": str(METHOD.stages if target.is_adaptive else POWERS),
-        **events.sizes(functions),
+        **sizes(functions),
     }
     if model.has_sweep:
         exact["eom_gauss_sweep"] = f"{functions.prefix}_{METHOD.name}_iterate"
@@ -165,13 +167,13 @@ def tables(functions: SceneFunctions) -> tuple[str, ...]:
     }
     return (
         *(c_matrix(f"eom_gauss_{name}", rows, real) for name, rows in matrices.items()),
-        *(events.tables(functions) if functions.target.system.events else ()),
+        *(event_tables(functions) if functions.target.system.events else ()),
     )
 
 
 def max_events_per_step(system: System) -> int:
     """Return the number of events in one step at which the step is ended early."""
-    return events.EVENTS_PER_STEP + sum(e.begins is not None for e in system.events)
+    return EVENTS_PER_STEP + sum(e.begins is not None for e in system.events)
 
 
 def steps_in_parallel(target: Target) -> bool:
@@ -216,3 +218,94 @@ def header(functions: SceneFunctions, workspace: int = 0, width: int = 0) -> str
         in_parallel=not functions.is_portable and steps_in_parallel(target),
         max_events=max_events_per_step(s),
     )
+
+
+SAMPLES = 9  # values of an event function in a step
+EVENTS_PER_STEP = 32  # without events at the same time
+DIRECTIONS = {"falling": -1, "both": 0, "rising": 1}
+
+COMMENTS = {  # of the tables of integers, by name
+    "direction": "Directions in which the events trigger: -1 falling, 1 rising, 0 both.",
+    "action": "Actions of the events: 0 record, 1 stop, 2 jump.",
+    "above": "Whether the event leaves zero upwards in any case.",
+    "mode": "Indices of each friction mode and of the coordinate that it belongs to.",
+    "jump_sets": "Which entries of [q, qd] the jump of each event sets.",
+}
+
+
+def sizes(functions: SceneFunctions) -> dict[str, str]:
+    """Return the texts of the library's constants that depend on the scene's events."""
+    target = functions.target
+    system, is_double = target.system, target.real.epsilon < 1e-10
+    initial = sum(e.begins is not None for e in system.events)
+    return {
+        "EOM_SAMPLES": str(SAMPLES),
+        "EOM_MAX_EVENTS": str(EVENTS_PER_STEP + initial),
+        "EOM_MAX_SIMULTANEOUS": str(EVENTS_PER_STEP + 4 * initial),
+        "EOM_OWN_EVENTS": str(len(system.own_events)),
+        "EOM_MODES": str(len(system.modes)),
+        "EOM_CLOSE": target.literal(1e-10 if is_double else 1e-5),
+        "EOM_DIFFERENCE": target.literal(1e-6 if is_double else 1e-3),
+        "EOM_SHIFT": target.literal(1e-7 if is_double else 1e-4),
+    }
+
+
+def event_tables(functions: SceneFunctions) -> tuple[str, ...]:
+    """Return the tables of the library that depend on the scene's events, and nodes and weights."""
+    target = functions.target
+    system, x, real = target.system, chebyshev_nodes(), target.real
+    stages = GAUSS16.stages
+    integers: dict[str, Sequence[Sequence[int]] | Sequence[int]] = {
+        "direction": [DIRECTIONS[e.direction] for e in system.events],
+        "action": [ACTIONS.index(e.action) for e in system.events],
+        "above": [int(e.above) for e in system.events],
+    }
+    if system.modes:
+        integers["mode"] = [(m.at, m.of) for m in system.modes]
+    if system.own_events:
+        integers["jump_sets"] = _jump_flags(target)
+    return (
+        *(c.define_int_table(f"eom_{name}", row, COMMENTS[name]) for name, row in integers.items()),
+        c_vector("eom_nodes", x, real, "Chebyshev nodes, as fractions of a step."),
+        c_matrix("eom_once_integrated", power_integrals(x, stages, 1), real),
+        c_matrix("eom_twice_integrated", power_integrals(x, stages, 2), real),
+    )
+
+
+def _jump_flags(target: Target) -> list[list[int]]:
+    """Return, for each event of the scene, flags of the entries of [q, qd] that jump."""
+    coordinates = [target.scene_name(c.name) for c in target.system.coordinates]
+    states = [name + end for end in ("", "_dot") for name in coordinates]
+    rows = ({name for name, _ in e.jump} for e in target.system.own_events)
+    return [[int(name in names) for name in states] for names in rows]
+
+
+def chebyshev_nodes() -> Row:
+    """Return the fractions of a step, from 0 to 1, at which event functions are evaluated.
+
+    They are the extrema of a Chebyshev polynomial and include both ends.
+    """
+    last = SAMPLES - 1
+    return tuple(Fraction((1 - cos(pi * j / last)) / 2).limit_denominator(10**12)
+                 for j in range(SAMPLES))  # fmt: skip
+
+
+def power_integrals(x: Row, count: int, times: int) -> Sequence[Row]:
+    """Return the integrals of the powers (2 c - 1)^n over c, from 0 to each x.
+
+    The result has a row for each x and a column for each power n < `count`. With `times` = 2, it
+    has the integrals of these integrals.
+    """
+    signs = [Fraction((-1) ** n) for n in range(count + 3)]
+
+    def once(n: int, at: Fraction) -> Fraction:
+        power = Fraction(1)
+        for _ in range(n + 1):
+            power *= 2 * at - 1
+        return (power - signs[n + 1]) / (2 * (n + 1))
+
+    def twice(n: int, at: Fraction) -> Fraction:
+        return (once(n + 1, at) - signs[n + 1] * at) / (2 * (n + 1))
+
+    integral = (once, twice)[times - 1]
+    return [tuple(integral(n, at) for n in range(count)) for at in x]

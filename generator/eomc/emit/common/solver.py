@@ -2,26 +2,101 @@
 
 The library calls the model's functions by a struct with the arguments that only the model has, such
 as inputs and parameters. `SolverModel` has these functions; `library_names` the names of the
-library in the model's source; and `tableau_tables` the coefficients of a method.
+library in the model's source; `tableau_tables` the coefficients of a method; `step_derivatives` and
+`projected_step_source` the parts for derivatives of steps and for projections onto constraints.
 """
 
 from __future__ import annotations
 
 import math
 import re
+import struct
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import cache
+from itertools import accumulate
 
+from sympy import Rational
+
+from eomc.emit.common import c_expression, c_function
 from eomc.emit.common import c_function as c
 from eomc.emit.common.amalgamate import Names, amalgamate
-from eomc.emit.common.c_expression import Block
-from eomc.emit.common.c_function import CArgument, CFunction
-from eomc.emit.common.coefficients import c_matrix, c_vector, round_weights
+from eomc.emit.common.c_expression import Block, Real
+from eomc.emit.common.c_function import (
+    CArgument,
+    CFunction,
+    define_int_table,
+    define_table,
+    initialiser_rows,
+)
+from eomc.emit.common.c_names import Target
 from eomc.emit.common.functions import SceneFunctions
 from eomc.emit.common.public import program_function
 from eomc.emit.common.templates import show
-from eomc.integrators.tableaux import Method
+from eomc.integrators.tableaux import Method, Row
+
+
+@cache
+def literal(x: Fraction, real: Real) -> str:
+    """Return the fraction x as a C literal of the type `real`."""
+    return c_expression.number(Rational(x.numerator, x.denominator), real)
+
+
+def _nearest(x: Fraction, real: Real) -> Fraction:
+    """Return the nearest double, or the float nearest to it."""
+    form = {"float64": "d", "float32": "f"}[real.dtype]
+    return Fraction(*struct.unpack(form, struct.pack(form, float(x))))
+
+
+def round_weights(weights: Row, real: Real) -> Row:
+    """Return the weights of a method rounded to the type `real` such that their sum stays exact.
+
+    An error of the sum would accumulate over steps. It is therefore corrected in the smallest
+    weight for which this is exact, or in two equal weights if the method is symmetric.
+    """
+    if not real.dtype:  # 113 bits, for references
+        return weights
+    values = [_nearest(x, real) for x in weights]
+    error = Fraction(round(sum(weights, Fraction(0)))) - sum(values, Fraction(0))
+    symmetric = weights == weights[::-1] and len(weights) > 1
+    for k in sorted(range(len(values)), key=lambda k: abs(values[k])):
+        indices = {k, len(values) - 1 - k} if symmetric else {k}
+        corrected = values[k] + error / len(indices)
+        if values[k] and _nearest(corrected, real) == corrected:
+            return tuple(corrected if n in indices else x for n, x in enumerate(values))
+    return tuple(values)
+
+
+def literals(row: Row, real: Real) -> tuple[str, ...]:
+    """Return each coefficient of a row as a C literal of the type `real`."""
+    return tuple(literal(x, real) for x in row)
+
+
+def matrix_rows(rows: Sequence[Row], real: Real) -> tuple[str, ...]:
+    """Return the lines of a C initialiser for a square matrix, one line for each row.
+
+    Rows shorter than the matrix are padded with zeros.
+    """
+    padded = [(*row, *[Fraction(0)] * (len(rows) - len(row))) for row in rows]
+    return c_function.initialiser_rows(literals(row, real) for row in padded)
+
+
+def c_vector(name: str, row: Row, real: Real, comment: str = "") -> str:
+    """Return the C definition of a constant vector of coefficients under the library's names.
+
+    comment: text of the comment above the definition; "" for none.
+    """
+    return c_function.define_table(name, [len(row)], [", ".join(literals(row, real))], comment)
+
+
+def c_matrix(name: str, rows: Sequence[Row], real: Real) -> str:
+    """Return the C definition of a constant matrix; short rows are padded with zeros."""
+    width = max(map(len, rows))
+    padded = ((*row, *[Fraction(0)] * (width - len(row))) for row in rows)
+    lines = c_function.initialiser_rows(literals(row, real) for row in padded)
+    return c_function.define_table(name, [len(rows), width], lines)
+
 
 # Files of csrc/solver with the methods of fixed steps, in the order in which C needs them.
 STEP_FILES = {
@@ -363,3 +438,192 @@ def tableau_tables(functions: SceneFunctions, method: Method) -> tuple[str, ...]
         c_vector(f"{name}b", round_weights(method.b, real), real),
         c_vector(f"{name}bA", method.b_a, real),
     )
+
+
+def step_derivatives(model: SolverModel) -> Iterator[str]:
+    """Yield C definitions of the derivatives of a step of each integration method.
+
+    The derivatives are with respect to q, qd and u. Nothing is yielded if the scene does not
+    request them. Methods share definitions.
+    """
+    functions, target = model.functions, model.functions.target
+    if not target.system.run.discretize:
+        return
+    inputs = bool(target.system.inputs)
+    features = {
+        "INPUTS": inputs,
+        "FEEDBACK": "signal_slopes" in target.program,
+        "CONSTRAINTS": functions.projection_along is not None,
+    }
+    width = f"2*{functions.NQ}" + (f" + {functions.NU}" if inputs else "")
+    exact = {"EOM_VARIABLES": width}
+    if model.has_sweep:  # whose accelerations take precomputed constants
+        exact["eom_accelerate"] = f"{functions.prefix}_evaluate_accelerations"
+    for method in functions.methods:
+        kind = "implicit" if method.implicit else "explicit"
+        tables = (f"eom_{method_kind(method)}_{name}" for name in ("c", "A", "AA", "b", "bA"))
+        yield from amalgamate(
+            ("step_end.c", "step_derivative.c"),
+            [f"eom_method_differentiate_{kind}_step", "eom_store_derivatives", *tables],
+            library_names(model, method, **exact),
+            features,
+            tableau_tables(functions, method),
+        )
+        yield _derivative(model, method, width)
+
+
+def _derivative(model: SolverModel, method: Method, width: str) -> str:
+    """Return the definition of the public function for the derivatives of a step of a method.
+
+    width: number of variables in q, qd and u, as a C expression.
+    """
+    functions, prefix = model.functions, f"{model.functions.prefix}_{method.name}"
+    function = functions.public.derivative(method.name)
+    NQ, real = functions.NQ, functions.real
+    # the end of the step itself, with which stages that may have other solutions are compared
+    compares = method.implicit or functions.projection_along is not None
+    end, time = ("q1", "qd1") if compares else (), "t" if functions.target.driven else "0"
+    step = f"{prefix}_make_step({', '.join([*end, time, 'h', *model.passed])})"
+    make_step = (*c.copy_loop("q1", "q", 0, NQ), *c.copy_loop("qd1", "qd", 0, NQ),
+                 c.assign("status", step), *c.return_if(["status"], "status"))  # fmt: skip
+    call = model.call(
+        f"{method.name}_differentiate_{'implicit' if method.implicit else 'explicit'}_step",
+        "ends", *end, "q", "qd", time, "h",
+    )  # fmt: skip
+    out = [a.name for a in function.arguments if a.name in ("Phi", "Gamma")]
+    store = f"{functions.prefix}_store_derivatives({', '.join([*out, 'ends'])})"
+    unused = {a.name: "0" for a in model.members if a.name == "c"}
+    variables = (
+        *model.variable(**unused).lines,
+        c.declare(functions.status, "status"),
+        c.declare(real, f"ends[2*{NQ}*({width})]"),
+        *(c.declare(real, f"{name}[{NQ}]") for name in end),
+    )
+    statements = (
+        *(make_step if compares else ()), c.assign("status", call),
+        c.return_statement(f"status ? status : {store}"),
+    )  # fmt: skip
+    return define(function, Block("", variables), Block("", statements))
+
+
+def correction_size(target: Target) -> int:
+    """Return the number of results of the C function that computes corrections for constraints.
+
+    The results are the corrections that move q and qd onto the constraints, and one inverse pivot
+    for each constraint equation.
+    """
+    return len(target.program["projection"].outputs)
+
+
+def step_features(functions: SceneFunctions, increments: bool, sines: bool) -> dict[str, bool]:
+    """Return which features of csrc/solver/step_projection.c a model has.
+
+    increments: whether the end of a step is given by the increments of q and q̇. sines: whether the
+    correction takes sines and cosines.
+    """
+    return {
+        "INCREMENTS": increments,
+        "SINES": sines,
+        "RATE_TERMS": "rate_terms" in functions.target.program,
+        "SINGLE": functions.target.system.run.real == "float",
+    }
+
+
+def projected_step_source(model: SolverModel) -> tuple[str, ...]:
+    """Return the projection of steps and of their stages onto the constraints, in portable C."""
+    functions = model.functions
+    if functions.projection is None:
+        return ()
+    size = str(correction_size(functions.target))
+    return amalgamate(
+        ("step_projection.c",),
+        ["eom_project_end", *(["eom_project_stage"] if functions.iterates_stages else [])],
+        library_names(model, EOM_CORRECTION_SIZE=size),
+        step_features(functions, increments=False, sines=False),
+    )
+
+
+def project_end(model: SolverModel, r: str, v: str, q: str, t: str) -> str:
+    """Return the C call that projects the end r, v of a step from q, in portable C.
+
+    t: C expression of the time at the end, for a motion that depends on time.
+    """
+    time = t if model.functions.target.driven else "0"
+    return model.call("project_end", r, v, q, time, last=["singular"])
+
+
+def state_source(model: SolverModel) -> tuple[str, ...]:
+    """Return the public function `project` and its part of the library, as C definitions.
+
+    The function projects a state (q, qd) onto the constraints.
+    """
+    functions = model.functions
+    rows, closure = functions.target.system.constraints, functions.target.system.closure
+    if not rows:
+        return ()
+    rotations = functions.target.system.rotations if functions.rotation_errors else ()
+    holonomic = sum(row.holonomic for row in rows)
+    sizes = {
+        "EOM_HOLONOMIC_ROWS": holonomic,
+        "EOM_SUMS": len(closure.sums) if closure else 0,
+        "EOM_ROTATIONS": len(rotations),
+        "EOM_ROTATION_ROWS": sum(map(len, rotations)),
+    }
+    weighted = bool(closure and closure.weights)
+    features = {
+        "HOLONOMIC": bool(holonomic),
+        "MULTIPLE": len(rows) > 1,
+        "SEARCH": any(row.holonomic and row.loop for row in rows),
+        "ROTATIONS": bool(rotations),
+        "WEIGHTS": weighted,
+        "SUMS": bool(closure and closure.sums),
+        "REDUNDANT": any(redundant_rows(functions.target)),
+        "PINNED": weighted and holonomic < len(rows),
+    }
+    public = functions.public.project
+    time = "t" if any(a.name == "t" for a in public.arguments) else "0"
+    call = model.call("project_state", "q", "qd", time, "fixed")
+    unused = {a.name: "0" for a in model.members if a.name != "p"}
+    return (
+        *amalgamate(
+            ("projection.c",),
+            ["eom_project_state"],
+            library_names(model, None, **{name: str(size) for name, size in sizes.items()}),
+            features,
+            _tables(functions),
+        ),
+        define(public, model.variable(**unused), Block("", (c.return_statement(call),))),
+    )
+
+
+def redundant_rows(target: Target) -> list[bool]:
+    """Return whether each constraint equation is redundant, since others or their sums imply it."""
+    rows, closure = target.system.constraints, target.system.closure
+    summed = summed_rows(target)[len(closure.sums) if closure else 0 :]
+    return [row.redundant or k in summed for k, row in enumerate(rows)]
+
+
+def summed_rows(target: Target) -> list[int]:
+    """Return the indices of the constraint equations in sums that replace some of them."""
+    closure = target.system.closure
+    return sorted({k for row in (closure.sums if closure else ()) for k, x in enumerate(row) if x})
+
+
+def _tables(functions: SceneFunctions) -> list[str]:
+    """Return tables of the constraint equations: weights, sums, redundant ones, and rotations."""
+    target = functions.target
+    closure, count = target.system.closure, len(target.system.constraints)
+    weights, sums = (closure.weights, closure.sums) if closure else ((), ())
+    rotations = target.system.rotations if functions.rotation_errors else ()
+    integers = {
+        "sum_rows": summed_rows(target)[: len(sums)],
+        "redundant_rows": [*map(int, redundant_rows(target))],
+        "rotation_rows": [k for rows in rotations for k in rows],
+        "rotation_ends": [*accumulate(map(len, rotations))],
+    }
+    sum_lines = initialiser_rows([*map(target.literal, row)] for row in sums)
+    return [
+        define_table("eom_row_weights", [count], [", ".join(map(target.literal, weights))]),
+        define_table("eom_row_sums", [len(sums), count], sum_lines),
+        *(define_int_table(f"eom_{name}", values) for name, values in integers.items() if values),
+    ]

@@ -13,7 +13,7 @@ from functools import cached_property
 from sympy import Expr, S
 
 from eomc.emit.common import c_function as c
-from eomc.emit.common import projection
+from eomc.emit.common import solver
 from eomc.emit.common.amalgamate import amalgamate
 from eomc.emit.common.c_expression import DOUBLE, FOUR, MIN_SIMD_ANGLES, Block, CBody, Printer, Real
 from eomc.emit.common.c_function import CArgument, CFunction, GeneratedFunction
@@ -862,13 +862,13 @@ class Lane:
         members = (self.argument("c"),) if "c" in takes else ()
         names = library_names(
             SolverModel(functions, members, (), self.c_width),
-            EOM_CORRECTION_SIZE=str(projection.correction_size(self.target)),
+            EOM_CORRECTION_SIZE=str(solver.correction_size(self.target)),
             eom_model=self.constants,
             eom_sines=f"{self.prefix}_sines",
         )
         rate_terms = self.rate_terms
         roots = ["eom_project_end", *(["eom_project_stage"] if functions.iterates_stages else [])]
-        features = projection.step_features(functions, increments=True, sines=sines)
+        features = solver.step_features(functions, increments=True, sines=sines)
         t = "t" if "t" in takes else "0"
         end = [*("r", "v", "q", "qd"), *(["s"] if sines else []), t, *("c" if "c" in takes else ())]
         stage = ["at", "moving", t, *("c" if "c" in takes else ())]
