@@ -21,10 +21,10 @@ BLOCK = re.compile(r"(?:^`([\w./]+)`:\n\n)?^```(\w+)\n(.*?)^```", re.MULTILINE |
 TOOLS = {
     "In a C program": ["cc"],
     "In a CMake project": ["cmake", "g++", "pkg-config"],
-    "On a small core": ["arm-none-eabi-gcc", "qemu-system-arm"],
-    "On a bare RISC-V core": ["riscv64-unknown-elf-gcc", "qemu-system-riscv32"],
+    "On a microcontroller": ["arm-none-eabi-gcc", "qemu-system-arm"],
+    "On a bare-metal RISC-V core": ["riscv64-unknown-elf-gcc", "qemu-system-riscv32"],
     "A control loop": ["cc"],
-    "A model's wheel": ["cc"],
+    "A Python wheel": ["cc"],
 }
 
 
@@ -56,7 +56,7 @@ def test_every_section_is_run() -> None:
 def test_section_works_as_documented(section: str, tmp_path: Path) -> None:
     for tool in TOOLS[section]:
         needs(tool)
-    if section == "On a small core":
+    if section == "On a microcontroller":
         shutil.copytree(EXAMPLES / "cortex_m", tmp_path / "cortex_m")
     if section == "A control loop":
         pytest.importorskip("scipy")
