@@ -8,6 +8,7 @@ robots. Prints for each scene and number of states a call:
 
 - acc: time of `acceleration` a state, ns;
 - linearize: `linearize`, in accelerations;
+- vjp, jvp: `acceleration_vjp` and `acceleration_jvp`, in accelerations, parameters included;
 - RK4: `discretize` by RK4, in accelerations and in `linearize`;
 - faults: page faults a state of `linearize`; the allocator then returns memory after each call;
 - error: the largest difference of A and B from differences of the accelerations (of order 8, in
@@ -62,7 +63,7 @@ STENCIL = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))  # central diff
 
 def load(name: str, root: Path) -> Any:
     """Return the module of a scene with the derivatives."""
-    options, text = "[run]\nlinearize = true\ndiscretize = true\n", SCENES[name]()
+    options, text = '[run]\nlinearize = "products"\ndiscretize = true\n', SCENES[name]()
     has_run = "[run]\n" in text
     text = text.replace("[run]\n", options) if has_run else f"{text}\n{options}"
     path = root / f"{name}.toml"
@@ -117,6 +118,8 @@ def rows(name: str, m: Any, states: list[int], rounds: int) -> None:
         calls: dict[str, Callable[[], Any]] = {
             "acc": partial(m.acceleration, q, qd, **inputs),
             "linearize": partial(m.linearize, q, qd, **inputs),
+            "vjp": partial(m.acceleration_vjp, q, qd, q, **inputs),
+            "jvp": partial(m.acceleration_jvp, q, qd, (q, qd, u), **inputs),
             "discretize": partial(m.discretize, q, qd, 1e-3, **inputs),
         }
         times = shortest(calls, rounds)
@@ -125,6 +128,7 @@ def rows(name: str, m: Any, states: list[int], rounds: int) -> None:
         faults = count_faults(calls["linearize"]) / count
         print(
             f"| {name} | {count} | {one / count * 1e9:.0f} ns | {ratios['linearize']} "
+            f"| {ratios['vjp']} | {ratios['jvp']} "
             f"| {ratios['discretize']} = "
             f"{times['discretize'] / linear:.1f} linearize "
             f"| {faults:.2f} | {difference_error(m, q, qd, u):.0e} |",
@@ -138,8 +142,8 @@ def main() -> None:
     parser.add_argument("--states", type=int, nargs="+", default=[500, 2000])
     parser.add_argument("--rounds", type=int, default=9)
     options = parser.parse_args()
-    print("| scene | states | acc | linearize | RK4 | faults | error |")
-    print("|---|---|---|---|---|---|---|", flush=True)
+    print("| scene | states | acc | linearize | vjp | jvp | RK4 | faults | error |")
+    print("|---|---|---|---|---|---|---|---|---|", flush=True)
     for name in options.names or SCENES:
         with tempfile.TemporaryDirectory() as folder:
             rows(name, load(name, Path(folder)), options.states, options.rounds)

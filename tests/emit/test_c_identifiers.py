@@ -117,7 +117,7 @@ x = "push"
 real = "{real}"
 method = ["rk4", "dp8"]
 batch = true
-linearize = "parameters"
+linearize = "products"
 """
 
 

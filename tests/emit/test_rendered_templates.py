@@ -56,7 +56,7 @@ TEMPLATES = sorted(
 EVENTS = '[[event]]\nname = "low"\nwhen = "theta - 0.1"\naction = "record"\n'
 # scenes, and settings of [run] or further tables, that together use every template
 RENDERED = {
-    "cartpole": '[run]\nreal = "float"\nbatch = true\ntolerance = 1e-4\nlinearize = true\n',
+    "cartpole": '[run]\nreal = "float"\nbatch = true\ntolerance = 1e-4\nlinearize = "products"\n',
     "cartpole_driven": '[run]\nmethod = ["rk4", "dp8", "gauss4", "gauss16"]\ndiscretize = true\n',
     "bead_on_hoop": EVENTS,
     "four_bar": "[run]\nbatch = true\n",

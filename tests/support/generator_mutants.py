@@ -54,7 +54,7 @@ RICH = {  # of scenes/, with lines added under [run] and at the end
     "mass_spring": ('method = ["rk4", "verlet", "gauss6"]\ntolerance = 1e-7\n', STOPS),
     "cartpole_driven": (
         'tolerance = 1e-8\nmethod = ["rk4", "dp8"]\nbatch = true\n'
-        "linearize = true\ndiscretize = true\n",
+        'linearize = "products"\ndiscretize = true\n',
         EVENT,
     ),
     "double_pendulum": (

@@ -8,6 +8,7 @@ frames, inverse dynamics, momentum, derivatives of steps, constraints and closed
 
 from __future__ import annotations
 
+import json
 import math
 import random
 import re
@@ -239,9 +240,7 @@ class Author:
         if self.chance(0.1):
             run.append('real = "float"')
         if self.chance(0.25) and not self.corners:
-            run.append(
-                f"linearize = {self.one(['true', 'true', chr(34) + 'parameters' + chr(34)])}"
-            )
+            run.append(f"linearize = {self.one(['true', *map(json.dumps, SLOPES)])}")
 
     def energies(self) -> str:
         for _ in range(self.random.choice([1, 1, 2, 2, 3, 4])):
@@ -323,6 +322,7 @@ def scene_text(seed: int) -> str:
     return author.bodies() if author.chance(0.25) else author.energies()
 
 
+SLOPES = ("products", "parameters")
 TOLERANCES = ["1e-4", "1e-6", "1e-9", "1e-9", "1e-12"]
 WISHES = {"linearize": 0.3, "inverse_dynamics": 0.25, "discretize": 0.15}
 

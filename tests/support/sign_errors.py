@@ -174,7 +174,8 @@ def changes(right: Any, wrong: Any, seed: int) -> bool:
         q = q0 + spread * draw.uniform(-1, 1, q0.shape)
         qd = qd0 + (spread or 0.1) * draw.uniform(-1, 1, q0.shape)
         t = float(draw.uniform(0, 1))
-        for ask in (*map(_value, FUNCTIONS), _slopes, _sensitivity, *map(_step, right.methods)):
+        values = (*map(_value, FUNCTIONS), _slopes, _sensitivity, _products)
+        for ask in (*values, *map(_step, right.methods)):
             one, other = (_try(ask, m, q, qd, t) for m in (right, wrong))
             if one is None or not np.all(np.isfinite(one)):
                 continue
@@ -207,6 +208,15 @@ def _slopes(m: Any, q: Any, qd: Any, t: float) -> Any:
 
 def _sensitivity(m: Any, q: Any, qd: Any, t: float) -> Any:
     return m.sensitivity(q, qd, t=t)
+
+
+def _products(m: Any, q: Any, qd: Any, t: float) -> Any:
+    if "acceleration_vjp" not in dir(m):
+        raise ValueError
+    weights = np.arange(1.0, 1 + m.nq)
+    along = [np.arange(1.0, 1 + k) for k in (m.nq, m.nq, m.nu, len(m.parameters))]
+    rates = m.acceleration_jvp(q, qd, along, t=t)
+    return np.concatenate([*m.acceleration_vjp(q, qd, weights, t=t), rates])
 
 
 def _step(method: str) -> Ask:

@@ -10,9 +10,9 @@ from sympy import Expr, Rational, S, Symbol
 from eomc.base.errors import SceneError
 from eomc.derive.energies import leaves, tangent_symbols
 from eomc.derive.ldl import Rows, Vector
-from eomc.derive.tape import NotDifferentiableError, Tape
-from eomc.model.symbols import Output, dot, needed_definitions
-from eomc.model.system import System, t
+from eomc.derive.tape import NotDifferentiableError, Stage, Tape
+from eomc.model.symbols import ALONG, Output, dot, needed_definitions
+from eomc.model.system import System, symbol, t
 
 # the bound of roots that are differentiated: far below any root but 0, its reciprocal is finite and
 # the square of that overflows
@@ -116,7 +116,7 @@ def _outputs(
     values = tuple(tape.named(value(o.formula), o.name) for o in system.outputs)
     if not with_derivatives:
         return Outputs(tape, values, ((),) * len(values))
-    parameters = system.parameters if system.run.linearize == "parameters" else ()
+    parameters = system.parameters if system.run.by_parameters else ()
     variables = (*state, *system.u, *system.qdd, *(p.symbol for p in parameters))
     saved, tape.constant_leaves = tape.constant_leaves, frozenset()  # discrete variables count here
     least = LEAST_ROOT[system.run.real]
@@ -182,6 +182,34 @@ def sensitivity(system: System, tape: Tape, accelerations: Sequence[Expr]) -> Ro
     """
     entries = [{p.symbol: S.One} for p in system.parameters]
     return tuple(zip(*_slopes(system, tape, accelerations, entries), strict=True))
+
+
+def jacobian_products(
+    system: System, tape: Tape, accelerations: Sequence[Expr]
+) -> tuple[Vector, Vector]:
+    """Return the products J v and w^T J of the accelerations' Jacobian J = da/d[q, qd, u, p].
+
+    The components of v, one for each variable, and of w, one for each acceleration, are symbols:
+    the variable's name with the suffix `ALONG`. The products cost a small multiple of the
+    accelerations, whatever the number of columns of J: the first by a forward sweep over the tape,
+    the second by a reverse sweep (Griewank & Walther, ch. 3). Raises SceneError if the
+    accelerations contain a discontinuous function.
+    """
+    variables = (*system.q, *system.qd, *system.u, *(p.symbol for p in system.parameters))
+    entries = {x: symbol(f"{x.name}{ALONG}") for x in (*variables, *system.qdd)}
+    stages = dict.fromkeys(entries.values(), Stage.VELOCITY)
+    tape.leaves |= stages
+    tape.stage |= stages
+    (forward,) = _slopes(system, tape, accelerations, [{x: entries[x] for x in variables}])
+    weights = [entries[x] for x in system.qdd]
+    varying = set(variables)  # what depends on nothing else may jump
+    for name in tape.live(accelerations):
+        varying |= {name} if varying.intersection(tape.parts[name]) else set()
+    saved, tape.constant_leaves = tape.constant_leaves, frozenset(tape.stage.keys() - varying)
+    pairs = list(zip(accelerations, weights, strict=True))
+    reverse = tape.gradient(pairs, variables, least=LEAST_ROOT[system.run.real])
+    tape.constant_leaves = saved
+    return forward, tuple(reverse)
 
 
 def _slopes(

@@ -16,6 +16,7 @@ from eomc.emit.common.public import KINDS
 from eomc.emit.common.templates import show
 from eomc.model.system import System
 from eomc.runtime.package import CONSTRAINED
+from eomc.scene.schema import RunSettings
 
 FUNCTIONS = {  # public functions of each package, by the part of `runtime.model.Model`
     "functions": "C D acceleration applied bias energy g jacobi kinetic_energy limits linearize "
@@ -23,14 +24,20 @@ FUNCTIONS = {  # public functions of each package, by the part of `runtime.model
     "integrator": "advice discretize simulate step".split(),
     "statics": ["equilibrium"],
 }
-OPTIONAL = {  # functions by the option that brings them
+OPTIONAL = {  # functions by the option that brings them, with its value if that is not "true"
+    'linearize "products"': ("acceleration_jvp", "acceleration_vjp"),
     "frames": ("pose", "frame_velocity", "frame_acceleration", "jacobian", "frame_forces"),
     "inverse_dynamics": ("inverse_dynamics", "drive_forces"),
     "momentum": ("momentum",),
 }
-_FRAMES = (*OPTIONAL["frames"], "inverse_dynamics", "momentum")  # functions of `Model.frames`
+# the parts of the model with optional functions other than "frames"
+_PARTS = {
+    "drive_forces": "statics", "acceleration_jvp": "functions", "acceleration_vjp": "functions",
+}  # fmt: skip
 # arrays of the binding with a row for each state
-_ROWS = frozenset({"q", "qd", "A_q", "A_qd", "B", "Phi", "Gamma"})
+_ROWS = frozenset(
+    {"q", "qd", "qdd", "along", "qdd_bar", "rates", "bar", "A_q", "A_qd", "B", "Phi", "Gamma"}
+)
 
 
 @dataclass(frozen=True)
@@ -60,6 +67,26 @@ class BoundFunction:
 
 
 @dataclass(frozen=True)
+class BoundAccelerations:
+    """The accelerations, or a product of their derivatives with a vector, called for n states.
+
+    Attributes
+    ----------
+    name
+        Name of the function.
+    out, vector
+        Names of the arrays for the results and with the vector; "" without a vector.
+    function
+        The scene's C function.
+    """
+
+    name: str
+    out: str
+    vector: str
+    function: CFunction
+
+
+@dataclass(frozen=True)
 class Binding:
     """The calls of the scene's functions in the Python binding, which evaluates many states."""
 
@@ -67,8 +94,22 @@ class Binding:
 
     @cached_property
     def evaluations(self) -> tuple[BoundFunction, ...]:
-        """The evaluation functions."""
-        return tuple(map(self._evaluation, self.scene.public.evaluations()))
+        """The evaluation functions, without products."""
+        names = (n for n, kind in KINDS.items() if self.scene.public.has(n) and not kind.is_product)
+        return tuple(map(self._evaluation, names))
+
+    @cached_property
+    def accelerations(self) -> tuple[BoundAccelerations, ...]:
+        """The accelerations, and the products of their derivatives with a vector."""
+        public = self.scene.public
+        names = (n for n, kind in KINDS.items() if public.has(n) and kind.is_product)
+        return (
+            BoundAccelerations("acceleration", "qdd", "", public.acceleration),
+            *(
+                BoundAccelerations(n, KINDS[n].out, KINDS[n].extra_argument, public.evaluation(n))
+                for n in names
+            ),
+        )
 
     @cached_property
     def parameters(self) -> str:
@@ -82,7 +123,9 @@ class Binding:
         passed: C expressions of other arguments, by name.
         """
         rows = {
-            a.name: f"{a.name} + {a.extent}*k" for a in f.arguments if a.extent and a.name in _ROWS
+            a.name: f"{a.name} + ({a.extent})*k" if "+" in a.extent else f"{a.name} + {a.extent}*k"
+            for a in f.arguments
+            if a.extent and a.name in _ROWS
         }
         own_t, own_u, own_p = (member("own", name) for name in "tup")
         rows |= {
@@ -97,11 +140,10 @@ class Binding:
         target = self.scene.target
         return cast(f"{target.prefix}_params", place) if target.needs_p else ""
 
-    def _evaluation(self, function: CFunction) -> BoundFunction:
-        """Return an evaluation function of the binding. function: that of the scene."""
+    def _evaluation(self, name: str) -> BoundFunction:
+        """Return an evaluation function of the binding. name: that of the quantity."""
         target, public = self.scene.target, self.scene.public
-        name = function.name.removeprefix(f"{target.prefix}_")
-        kind = KINDS[name]
+        kind, function = KINDS[name], self.scene.public.evaluation(name)
         extents = {a.name: a.extent for a in function.arguments}
         rows = {kind.out: f"out + {extents[kind.out]}*k"} if kind.out else {}
         if kind.extra_argument:  # passed in place of the inputs
@@ -159,7 +201,7 @@ def init(functions: SceneFunctions, extension: str) -> str:
         extension=extension,
         arguments=_model_arguments(target),
         exports=exports(target),
-        optional=tuple(x for x in OPTIONAL.items() if not getattr(run, x[0])),
+        optional=tuple(x for x in OPTIONAL.items() if not _has(run, x[0])),
         from_python=not target.system.file,
     )
 
@@ -217,6 +259,12 @@ def _constrained(s: System) -> tuple[Any, ...]:
     )
 
 
+def _has(run: RunSettings, option: str) -> bool:
+    """Return True if the settings of the scene contain an option of OPTIONAL."""
+    key, _, value = option.partition(" ")
+    return str(getattr(run, key)) == value.strip('"') if value else bool(getattr(run, key))
+
+
 def exports(target: Target) -> dict[str, str]:
     """Return the public functions of the Python package: attributes of the model by name.
 
@@ -230,7 +278,6 @@ def exports(target: Target) -> dict[str, str]:
     constrained = (*(CONSTRAINED if s.constraints else ()), *(["reactions"] if s.reactions else ()))
     functions |= {name: f"constraints.{name}" for name in constrained}
     for option, names in OPTIONAL.items():
-        if getattr(run, option):
-            parts = {name: "frames" if name in _FRAMES else "statics" for name in names}
-            functions |= {name: f"{part}.{name}" for name, part in parts.items()}
+        if _has(run, option):
+            functions |= {name: f"{_PARTS.get(name, 'frames')}.{name}" for name in names}
     return dict(sorted(functions.items()))

@@ -20,7 +20,7 @@ from eomc.emit.common.c_expression import DOUBLE
 from eomc.emit.common.c_function import CFunction, break_comments, member
 from eomc.emit.common.c_names import Target
 from eomc.emit.common.functions import SceneFunctions
-from eomc.emit.common.public import KINDS
+from eomc.emit.common.public import EXTRA_ARGUMENTS, KINDS
 from eomc.emit.common.templates import show
 from eomc.integrators.tableaux import DP8, METHODS, Method
 from eomc.model.symbols import ALONG, add_suffix
@@ -452,8 +452,7 @@ class _Cases:
         read.
         """
         values = {**nearby(self.system, k), TIME: t}
-        more = [x.name for x in (*self.system.qdd, *self.target.wrenches)]
-        more += self.target.multipliers
+        more = self.extra_names
         values |= {name: 0.4 + 0.3 * math.sin(1.7 * k + 2.1 * i) for i, name in enumerate(more)}
         exact = (lambda x: x) if self.double else _single
         return TestPoint(
@@ -466,11 +465,30 @@ class _Cases:
     @cached_property
     def varied_names(self) -> frozenset[str]:
         """Names of the values of a point other than parameters."""
-        return (
-            frozenset(nearby(self.system, 0)) - {p.name for p in self.system.parameters}
-            | {x.name for x in (*self.system.qdd, *self.target.wrenches)}
-            | {*self.target.multipliers}
-        )
+        return frozenset(nearby(self.system, 0)) - {p.name for p in self.system.parameters} | {
+            *self.extra_names
+        }
+
+    @cached_property
+    def extra_names(self) -> list[str]:
+        """Names of accelerations, frame forces and multipliers, then of the vectors of products."""
+        arrays = self.extra_arrays
+        names = [x for array in ("qdd", "wrenches", "lambda") for x in arrays[array]]
+        products = [n for n in ("along", "qdd_bar") if "acceleration_vjp" in self.program]
+        return [*names, *(x for array in products for x in arrays[array])]
+
+    @cached_property
+    def extra_arrays(self) -> dict[str, list[str]]:
+        """The names of the variables in each array of EXTRA_ARGUMENTS, in their order."""
+        s = self.system
+        along = [x.name for x in (*s.q, *s.qd, *s.u, *s.parameters)]
+        return {
+            "qdd": [x.name for x in s.qdd],
+            "wrenches": [x.name for x in self.target.wrenches],
+            "lambda": self.target.multipliers,
+            "along": [add_suffix(name, ALONG) for name in along],
+            "qdd_bar": [add_suffix(x.name, ALONG) for x in s.qdd],
+        }
 
     def with_inputs(self, point: TestPoint, beyond: float) -> TestPoint:
         """Return a copy of the point in which the inputs are specified.
@@ -510,15 +528,13 @@ class _Cases:
     def arrays(self) -> tuple[tuple[str, str], ...]:
         """Name and size (C text) of each array that C test functions take besides q and qd."""
         sizes = {a.name: a.extent for f in self.public.evaluations() for a in f.arguments}
-        return tuple((n, sizes[n]) for n in ("qdd", "wrenches", "lambda") if n in sizes)
+        return tuple((n, sizes[n]) for n in EXTRA_ARGUMENTS if n in sizes)
 
     def state(self, point: TestPoint) -> TestArguments:
         """Return the arguments of a test call at a point, with numbers as C literals."""
         s, literal = self.system, self.target.literal
-        names = {"qdd": [x.name for x in s.qdd], "lambda": self.target.multipliers}
-        names["wrenches"] = [x.name for x in self.target.wrenches]
         arrays = [[x.name for x in s.q], [x.name for x in s.qd]]
-        arrays += [names[name] for name, _ in self.arrays]
+        arrays += [self.extra_arrays[name] for name, _ in self.arrays]
         return TestArguments(
             arrays=tuple(tuple(literal(point.values[n]) for n in row) for row in arrays),
             t=literal(point.values[TIME]),
@@ -614,7 +630,7 @@ class _Cases:
 
         passed: C expressions of other arguments, by name.
         """
-        fields = ("q", "qd", "qdd", "wrenches", "lambda", "t", "u", "p")
+        fields = ("q", "qd", *EXTRA_ARGUMENTS, "t", "u", "p")
         at = {n: member("s", n) for n in fields}
         at |= {"t0": member("s", "t"), "h": member("s", "span")}
         return f.call(**at | passed)

@@ -14,7 +14,13 @@ from eomc.derive.constraints import projection, rate_terms
 from eomc.derive.frames import momentum, motions
 from eomc.derive.lagrange import MASSLESS, Derivation, EquationsOfMotion, inverse_dynamics
 from eomc.derive.ldl import Pairs, Solution, Vector
-from eomc.derive.outputs import STICKS, directional_derivatives, linearization, sensitivity
+from eomc.derive.outputs import (
+    STICKS,
+    directional_derivatives,
+    jacobian_products,
+    linearization,
+    sensitivity,
+)
 from eomc.derive.tape import Stage, Tape
 from eomc.integrators.tableaux import METHODS
 from eomc.model.symbols import ALONG, Output, dot, needed_definitions, symbol
@@ -160,9 +166,13 @@ def _derivatives(system: System, taken: Candidate) -> Iterator[Function]:
         by_rows = len(rows) == len(system.q) and len(rows[0]) > len(rows)
         name = "linearization" if by_rows else "linearization_column"
         yield lower(name, taken.tape, [x for row in rows for x in row], names, checks=taken.checks)
-    if run.linearize == "parameters" and system.parameters:
+    if run.by_parameters and system.parameters:
         rows = sensitivity(system, taken.tape, taken.outputs)
         yield lower("sensitivity", taken.tape, [x for row in rows for x in row], names)
+    if run.linearize == "products":
+        products = jacobian_products(system, taken.tape, taken.outputs)
+        for name, values in zip(("acceleration_jvp", "acceleration_vjp"), products, strict=True):
+            yield lower(name, taken.tape, values, names, checks=taken.checks)
 
 
 def _outputs(system: System, taken: Candidate) -> Iterator[Function]:

@@ -6,7 +6,7 @@ may be (n,), u (n, nu), and the value of a parameter (n,).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from math import copysign, inf
 from typing import Any, NamedTuple
 
@@ -660,6 +660,116 @@ class Functions(Component):
         slopes = self.evaluate("output_slopes", q, qd, t, u, params)
         by_qdd = slopes[..., 2 * self.nq + self.info.nu :]
         return E, self.evaluate("output_sensitivity", q, qd, t, u, params) + by_qdd @ E
+
+    def acceleration_jvp(
+        self, q: ArrayLike, qd: ArrayLike, along: Sequence[ArrayLike | None], t: float = 0.0,
+        u: Any = None, params: Any = None,
+    ) -> Array:  # fmt: skip
+        """Return the Jacobian-vector product J v: the derivative of the accelerations along v.
+
+        J contains the derivatives of the accelerations by q, qd, u and the parameters. The
+        derivatives are exact to rounding.
+
+        Parameters
+        ----------
+        q, qd : (nq,) or (n, nq) array_like
+            State, or several.
+        along : tuple (dq, dqd, du, dp)
+            The direction v: (nq,), (nq,), (nu,) and (np,), or a row for each state. None, or an
+            entry that is left out at the end: zeros.
+        t, u, params
+            As in `linearize`. The inputs are constant, even if a signal depends on the state.
+
+        Returns
+        -------
+        (nq,) or (n, nq) array
+
+        Raises
+        ------
+        MotionError
+            If D is singular or a derivative is not finite.
+        ValueError
+            If an argument is invalid.
+        """
+        parts = [*along]
+        sizes = (self.nq, self.nq, self.info.nu, len(self.info.parameters))
+        if len(parts) > len(sizes):
+            raise ValueError(f"along: {len(parts)} entries, expected (dq, dqd, du, dp)")
+        parts += [None] * (len(sizes) - len(parts))
+        vector = [
+            self.arguments.for_each_state(np.zeros(k) if x is None else x, f"along[{i}]", (k,), q)
+            for i, (k, x) in enumerate(zip(sizes, parts, strict=True))
+        ]
+        direction = np.concatenate(vector, axis=-1)
+        return self._product("acceleration_jvp", q, qd, direction, self.nq, (t, u, params))
+
+    def acceleration_vjp(
+        self, q: ArrayLike, qd: ArrayLike, qdd_bar: ArrayLike, t: float = 0.0, u: Any = None,
+        params: Any = None,
+    ) -> tuple[Array, ...]:  # fmt: skip
+        """Return the vector-Jacobian product J^T w: the gradient of w . qdd (reverse mode).
+
+        J contains the derivatives of the accelerations by q, qd, u and the parameters. The cost is
+        a few accelerations, whatever the number of parameters. The derivatives are exact to
+        rounding.
+
+        Parameters
+        ----------
+        q, qd : (nq,) or (n, nq) array_like
+            State, or several.
+        qdd_bar : (nq,) or (n, nq) array_like
+            The weights w of the accelerations, such as the derivatives of a cost by them.
+        t, u, params
+            As in `linearize`. The inputs are constant, even if a signal depends on the state.
+
+        Returns
+        -------
+        q_bar, qd_bar : (nq,) or (n, nq) arrays
+            Derivatives of w . qdd by q and qd.
+        u_bar, p_bar : (nu,) and (np,), or (n, nu) and (n, np) arrays
+            Derivatives by the inputs and by the parameters.
+
+        Raises
+        ------
+        MotionError
+            If D is singular or a derivative is not finite.
+        ValueError
+            If an argument is invalid.
+
+        References
+        ----------
+        A. Griewank, A. Walther, Evaluating Derivatives, 2nd ed., SIAM, 2008, ch. 3.
+        """
+        n, m = self.nq, self.info.nu
+        weights = self.arguments.for_each_state(qdd_bar, "qdd_bar", (n,), q)
+        width = 2 * n + m + len(self.info.parameters)
+        bar = self._product("acceleration_vjp", q, qd, weights, width, (t, u, params))
+        return tuple(np.split(bar, [n, 2 * n, 2 * n + m], axis=-1))
+
+    def _product(
+        self, name: str, q: ArrayLike, qd: ArrayLike, vector: Array, width: int,
+        conditions: tuple[Any, Any, Any],
+    ) -> Array:  # fmt: skip
+        """Return a product of the accelerations' derivatives with a vector.
+
+        name: of the C function. width: number of results for each state. conditions: t, u, params.
+        """
+        at, moving = self.arguments.state(q, qd)
+        result, n = empty((*at.shape[:-1], width), self.dtype), self.nq
+        acts = StateArguments(self.arguments, at.shape[:-1], *conditions)
+        to, by, from_q, from_qd = map(self.c.pointer, (result, vector, at, moving))
+        function, size = getattr(self.c.lib, name), vector.shape[-1]
+        completed, status = self._all_rows(
+            lambda k, many: function(
+                many, to + width * k, by + size * k, from_q + n * k, from_qd + n * k,
+                *acts.pointers(k),
+            ),
+            at.size // n, ROWS_PER_CALL // n**2 + 1,
+        )  # fmt: skip
+        if status != "ok":
+            what = "" if status == "singular" else "a derivative is not finite there"
+            refuse(status, at, moving, completed, what)
+        return result
 
     def rhs(self, t: float, x: ArrayLike, u: Any = None, params: Parameters = None) -> Array:
         """Return dx/dt = [qd; qdd] for x = [q; qd], as `scipy.integrate.solve_ivp` calls it.

@@ -249,7 +249,7 @@ class RunSettings:
     batch: bool = key(flag, "Generate functions for many trajectories at once.", False)
     linearize: bool | str = key(
         linearization,
-        'Generate derivatives of the accelerations; "parameters" adds those by the parameters.',
+        "Generate derivatives of the accelerations, by parameters too, and products with vectors.",
         False,
     )
     discretize: bool = key(
@@ -280,6 +280,11 @@ class RunSettings:
         They are needed for `linearize` and, to differentiate steps, for `discretize`.
         """
         return bool(self.linearize) or self.discretize
+
+    @property
+    def by_parameters(self) -> bool:
+        """True if derivatives with respect to the parameters must be generated."""
+        return self.linearize in ("parameters", "products")
 
 
 _TWO_BODIES = two_names('bodies, such as ["world", "cart"]')

@@ -270,13 +270,13 @@ def version(value: object) -> int:
 
 
 @value_type(
-    'true, false, "parameters"',
-    'true, false or "parameters"',
-    {"enum": [True, False, "parameters"]},
+    'true, false, "parameters", "products"',
+    'true, false, "parameters" or "products"',
+    {"enum": [True, False, "parameters", "products"]},
 )
 def linearization(value: object) -> bool | str:
     """Check the value of `linearize` in [run]."""
-    if isinstance(value, bool) or value == "parameters":
+    if isinstance(value, bool) or value in ("parameters", "products"):
         return value
     raise linearization.mismatch(value)
 

@@ -221,19 +221,22 @@ def relative_differences(values: Vector, exact: Vector, scales: Vector, size: Ve
 
 SLOPE_LIMIT = 1e-6  # error relative to the largest derivative, by differences of the reference
 UNIT = "of the largest derivative"
+PRODUCTS = ("acceleration_jvp", "acceleration_vjp")
 
 
 def derivative_checks(comparison: Comparison) -> Iterator[Check]:
-    """Yield the checks of `linearize`, `sensitivity` and `discretize`.
+    """Yield the checks of `linearize`, `sensitivity`, the products and `discretize`.
 
     They are checked if the scene requires them or an implicit method uses them.
     """
     run, limit = comparison.system.run, max(SLOPE_LIMIT, LIMIT * comparison.eps)
     linearizes = run.needs_derivatives or any(METHODS[m].newton for m in comparison.methods)
-    by_parameters = run.linearize == "parameters" and comparison.system.parameters
+    by_parameters = run.by_parameters and comparison.system.parameters
     far = comparison.sampler.far_states() if linearizes or by_parameters else []
     states = [*comparison.few(4), *far]
-    for name, required in (("linearize", linearizes), ("sensitivity", by_parameters)):
+    required_of = {"linearize": linearizes, "sensitivity": by_parameters}
+    required_of |= dict.fromkeys(PRODUCTS, run.linearize == "products")
+    for name, required in required_of.items():
         if required:
             yield Check(
                 name, partial(acceleration_error, name), tolerance=limit, states=states, unit=UNIT,
@@ -246,10 +249,11 @@ def derivative_checks(comparison: Comparison) -> Iterator[Check]:
 def acceleration_error(name: str, of: Comparison, e: Expected) -> float | None:
     """Return the largest relative error of the module's derivatives of accelerations at a state.
 
-    name: "linearize" (derivatives with respect to q, q̇ and u) or "sensitivity" (with respect to
-    the parameters). The exact values are difference quotients of the reference's accelerations with
-    steps of several widths. For each entry the width with the smallest error counts, since no width
-    makes a wrong entry right. The result is None if accelerations or differences are not finite.
+    name: "linearize" (derivatives with respect to q, q̇ and u), "sensitivity" (with respect to the
+    parameters), or one of PRODUCTS (with respect to all). The exact values are difference quotients
+    of the reference's accelerations with steps of several widths. For each entry the width with the
+    smallest error counts, since no width makes a wrong entry right. The result is None if
+    accelerations or differences are not finite.
     """
     if not of.has_finite_accelerations(e.state):
         return None
@@ -259,7 +263,8 @@ def acceleration_error(name: str, of: Comparison, e: Expected) -> float | None:
     derivatives = module_derivatives(of, name, s)
     if derivatives is None:
         return math.inf  # dq/dt = qd is violated
-    part = slice(0, first) if name == "linearize" else slice(first, None)
+    parts = {"linearize": slice(0, first), "sensitivity": slice(first, None)}
+    part = parts.get(name, slice(None))
     with np.errstate(all="ignore"):
         exact = differentiate(of.reference, s, scale, of.sampler.defaults)
         off = [relative_differences(derivatives, J[:, part], by[part], size) for J, by in exact]
@@ -272,12 +277,21 @@ def acceleration_error(name: str, of: Comparison, e: Expected) -> float | None:
 def module_derivatives(of: Comparison, name: str, s: State) -> Vector | None:
     """Return the module's derivatives of accelerations at a state, (nq, k).
 
-    name: "linearize", with k = 2 nq + nu columns for q, q̇ and u, or "sensitivity", with one column
-    for each parameter. The result is None if the module's matrices A and B contradict dq/dt = q̇.
+    name: "linearize", with k = 2 nq + nu columns for q, q̇ and u; "sensitivity", with one column
+    for each parameter; or one of PRODUCTS, with all these columns, from products with unit vectors.
+    The result is None if the module's matrices A and B contradict dq/dt = q̇.
     """
     n, arguments = len(of.system.q), {"u": s.u, "t": s.t, "params": s.params}
     if name == "sensitivity":
         return np.asarray(of.module.sensitivity(s.q, s.qd, **arguments))
+    if name in PRODUCTS:
+        sizes = (n, n, len(of.system.inputs), len(of.system.parameters))
+        count = n if name == "acceleration_vjp" else sum(sizes)
+        q, qd = (np.tile(x, (count, 1)) for x in (s.q, s.qd))
+        if name == "acceleration_vjp":
+            return np.hstack(of.module.acceleration_vjp(q, qd, np.eye(n), **arguments))
+        columns = np.split(np.eye(count), np.cumsum(sizes)[:-1], axis=1)
+        return np.asarray(of.module.acceleration_jvp(q, qd, columns, **arguments)).T
     A, B = of.module.linearize(s.q, s.qd, **arguments)
     if not np.array_equal(A[:n], np.eye(n, 2 * n, n)) or np.any(B[:n]):
         return None

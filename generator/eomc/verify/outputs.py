@@ -52,7 +52,7 @@ def output_checks(comparison: Comparison) -> Iterator[Check]:
     error = partial(output_error, formulas, _outputs)
     yield Check("outputs", error, states=comparison.few(4), portable=True)
     derivatives = {"C, D": False} if run.needs_derivatives else {}
-    if derivatives and run.linearize == "parameters" and comparison.system.parameters:
+    if derivatives and run.by_parameters and comparison.system.parameters:
         derivatives["by parameters"] = True
     for name, by_parameters in derivatives.items():
         yield Check(

@@ -42,7 +42,7 @@ RESERVED_NAMES = frozenset(
     "steps every rows q_rows qd_rows u_stride a1 a2 a3 a4 h_2 h_6 hh_2 hh_4 hh_6 failed fixed at "
     "moving constants along column slopes outputs applied count failures point E poses velocities "
     "accelerations jacobians forces wrenches momentum events after phi rates lambda reactions "
-    "d far total singular A".split()
+    "d far total singular A bar qdd_bar".split()
 )
 # Macros and enumerators of the templates and csrc, without the scene's prefix. A coordinate or
 # input with such a name is renamed in C.
@@ -350,8 +350,8 @@ class Target:
         """Return definitions of C local variables for the array elements that a function reads.
 
         state, inputs: functions that map the name of an array and of a variable to the C expression
-        of the element. `state` is for the arrays q, qd, qdd and along (a direction); `inputs` is
-        for u.
+        of the element. `state` is for the arrays q, qd, qdd, along (a direction) and qdd_bar
+        (weights of the accelerations); `inputs` is for u.
         """
         s, real, uses = self.system, self.real.name, function.uses
         NQ = f"{self.PREFIX}_NQ"
@@ -365,6 +365,9 @@ class Target:
         read += [(add_suffix(c.q.name, ALONG), state("along", c.name)) for c in s.coordinates]
         along = [(c.qd.name, f"along[{NQ} + {self.enum[c.name]}]") for c in s.coordinates]
         along += [(name, f"along[2*{NQ} + {self.enum[name]}]") for name in self.input_names]
+        first = f"2*{NQ} + {self.PREFIX}_NU" if s.inputs else f"2*{NQ}"
+        along += [(p.name, f"along[{first} + {k}]") for k, p in enumerate(s.parameters)]
+        along += [(c.qdd.name, state("qdd_bar", c.name)) for c in s.coordinates]
         read += [(add_suffix(name, ALONG), element) for name, element in along]
         return [
             c_function.define_constant(real, local_name(name), element)
@@ -382,8 +385,8 @@ class Target:
     def groups(self) -> dict[str, frozenset[str]]:
         """Return the names of the variables that each C argument supplies, by the argument's name.
 
-        The arguments are q, qd, qdd, wrenches, lambda, t, u, p and along (a direction in q, qd and
-        u).
+        The arguments are q, qd, qdd, wrenches, lambda, t, u, p, along (a direction in q, qd, u and
+        p) and qdd_bar (weights of the accelerations).
         """
         s = self.system
         return {
@@ -395,7 +398,10 @@ class Target:
             "t": frozenset({TIME}),
             "u": frozenset(self.input_names),
             "p": frozenset(p.name for p in s.parameters),
-            "along": frozenset(add_suffix(x.name, ALONG) for x in (*s.q, *s.qd, *s.u)),
+            "along": frozenset(
+                add_suffix(x.name, ALONG) for x in (*s.q, *s.qd, *s.u, *s.parameters)
+            ),
+            "qdd_bar": frozenset(add_suffix(x.name, ALONG) for x in s.qdd),
         }
 
 

@@ -15,14 +15,21 @@ from eomc.emit.common import c_function as c
 from eomc.emit.common.c_expression import REALS, Block, CBody, Real, group_angles
 from eomc.emit.common.c_function import CArgument, CFunction, GeneratedFunction
 from eomc.emit.common.c_names import Target, cost_sentence, rename_reserved
-from eomc.emit.common.public import KINDS, Public, c_array_size, doc, program_function
+from eomc.emit.common.public import (
+    EXTRA_ARGUMENTS,
+    KINDS,
+    Public,
+    c_array_size,
+    doc,
+    program_function,
+)
 from eomc.integrators.tableaux import METHODS, Method
 from eomc.program import outline
 from eomc.program.ir import Function
 from eomc.program.program import Program
 
 STATE = ("q", "qd")
-ARGUMENT_NAMES = (*STATE, "qdd", "wrenches", "lambda", "t", "u", "p")
+ARGUMENT_NAMES = (*STATE, "qdd", "wrenches", "lambda", "qdd_bar", "t", "u", "p")
 ROTATION_ERRORS = (
     "Rotation errors of loops: 2 tan(a/2) n, if the second frame of a loop is rotated by the angle "
     "a about n; then cos(a/2)^2 of each; then the derivatives of the errors by q, by rows."
@@ -180,7 +187,7 @@ class SceneFunctions:
         Arrays are declared as pointers, without their size.
         """
         needed = [n for n in names if function.uses & self.supplied_names[n]]
-        arrays = (*STATE, "qdd", "wrenches", "lambda", "along")
+        arrays = (*STATE, *EXTRA_ARGUMENTS)
         return tuple(
             c.input_array(self.real, n) if n in arrays else self.public.argument(n) for n in needed
         )
@@ -338,7 +345,7 @@ class SceneFunctions:
             size, last = "1", Block("", (c.return_statement(f"{out}[0]"),))
             if self.public.refuses(name):
                 out, size, last = "a", c_array_size(target, kind.shape), self._status_block(name)
-            values, parts, calls = self.outline(function, name, out, ARGUMENT_NAMES)
+            values, parts, calls = self.outline(function, name, out, ("along", *ARGUMENT_NAMES))
             if out != kind.out:
                 declarations = Block("", (c.declare(self.real, f"{out}[{size}]"), *calls[0].lines))
                 calls = (declarations, calls[1], last)

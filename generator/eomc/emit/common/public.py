@@ -30,8 +30,8 @@ class Kind:
     shape
         Shape of the output, a key of `c_array_size`.
     takes
-        Arguments besides q, t and p, separated by spaces: qd, u, qdd, wrenches, lambda. "qdd?" if
-        only some scenes need the accelerations.
+        Arguments besides q, t and p, separated by spaces: qd, u, those of EXTRA_ARGUMENTS. "qdd?"
+        if only some scenes need the accelerations.
     doc
         The comment in the C header.
     symmetric
@@ -54,11 +54,17 @@ class Kind:
         return "u" in self.takes.split()
 
     @property
+    def is_product(self) -> bool:
+        """Whether the function takes a vector, in addition to the inputs: a product with it."""
+        return self.takes_u and bool(self.extra_argument)
+
+    @property
     def extra_argument(self) -> str:
-        """The argument qdd, wrenches or lambda if the function takes it in every scene, or ""."""
-        return next((n for n in ("qdd", "wrenches", "lambda") if n in self.takes.split()), "")
+        """The argument among EXTRA_ARGUMENTS if the function takes it in every scene, or ""."""
+        return next((n for n in EXTRA_ARGUMENTS if n in self.takes.split()), "")
 
 
+EXTRA_ARGUMENTS = ("qdd", "wrenches", "lambda", "along", "qdd_bar")
 KINDS: Mapping[str, Kind] = {
     "D": Kind("D", "n*n", "", "D(q): mass matrix, nq x nq, symmetric.", symmetric=True),
     "C": Kind("C", "n*n", "qd", "C(q, qd): Coriolis matrix, nq x nq, Christoffel form."),
@@ -74,6 +80,12 @@ KINDS: Mapping[str, Kind] = {
         "Power into the system, W: d(energy)/dt, or d(jacobi)/dt if there is one."),
     "sensitivity": Kind("E", "n*p", "qd u",
         "E = dqdd/dp at constant inputs: nq rows, a column for each parameter."),
+    "acceleration_jvp": Kind("rates", "n", "qd along u",
+        "Jacobian-vector product: rates = J along, with the derivatives J of the accelerations by "
+        "[q, qd, u, p] at constant inputs. along: a direction in [q, qd, u, p].", refuses=True),
+    "acceleration_vjp": Kind("bar", "x", "qd qdd_bar u",
+        "Vector-Jacobian product: bar = J^T qdd_bar, with the derivatives J of the accelerations "
+        "by [q, qd, u, p] at constant inputs. bar: in the order [q, qd, u, p].", refuses=True),
     "outputs": Kind("outputs", "y", "qd u qdd?", "Outputs of the scene, in the order above."),
     "output_slopes": Kind("slopes", "y*x", "qd u qdd?",
         "Partial derivatives [dy/dq, dy/dqd, dy/du, dy/dqdd] of outputs y, by rows."),
@@ -148,17 +160,19 @@ def c_array_size(target: Target, shape: str) -> str:
     so on. Returns "" for other shapes.
     """
     s, NQ, NU = target.system, f"{target.PREFIX}_NQ", f"{target.PREFIX}_NU"
+    np = len(s.parameters)
     NY, NF, NE, NC = (f"{target.PREFIX}_{n}" for n in ("NY", "NF", "NE", "NC"))
     pose, twist, momentum = (3, 3, 6) if s.plane else (12, 6, 10)
     return {
         "n*n": f"{NQ}*{NQ}",
-        "n*p": f"{NQ}*{len(s.parameters)}",
+        "n*p": f"{NQ}*{np}",
         "n": NQ,
+        "x": " + ".join((f"2*{NQ}", *([NU] if s.inputs else []), *([str(np)] if np else []))),
         "m": NU,
         "m*x": f"{NU}*2*{NQ}",
         "y": NY,
         "y*x": f"{NY}*(3*{NQ} + {NU})" if s.inputs else f"{NY}*(3*{NQ})",
-        "y*p": f"{NY}*{len(s.parameters)}",
+        "y*p": f"{NY}*{np}",
         "e": NE,
         "e*2*n": f"{NE}*2*{NQ}",
         "f*pose": f"{NF}*{pose}",
@@ -233,7 +247,8 @@ class Public:
         if name == "p":
             return input_array(f"{target.prefix}_params", name)
         extents = {"wrenches": c_array_size(target, "f*twist"), "lambda": c_array_size(target, "c")}
-        extents |= dict.fromkeys((*STATE, "qdd"), f"{target.PREFIX}_NQ")
+        extents |= dict.fromkeys((*STATE, "qdd", "qdd_bar"), f"{target.PREFIX}_NQ")
+        extents["along"] = c_array_size(target, "x")
         return input_array(real, name, extents.get(name, ""))
 
     def arguments(self, *names: str) -> tuple[CArgument, ...]:
