@@ -19,7 +19,7 @@ from eomc.emit.common import solver
 from eomc.emit.common.c_expression import DOUBLE, FLOAT, Real
 from eomc.integrators import tableaux
 from eomc.integrators.tableaux import DP8, METHODS, Method
-from eomc.verify import convergence, one_step
+from eomc.verify import convergence, reference
 from eomc.verify.comparison import Comparison, Measurement
 from eomc.verify.convergence import Advice, Convergence
 
@@ -60,9 +60,9 @@ def test_stability_limits(method: Method) -> None:
     """Check limits of an undamped oscillation and of a decay at the rate 1, to three digits."""
     undamped, decay = method.limits
 
-    def growth(acceleration: one_step.Acceleration, h: float) -> float:
+    def growth(acceleration: reference.Acceleration, h: float) -> float:
         q, qd = np.eye(2)[:, :, None]
-        ends = one_step.step(method, acceleration, q, qd, 0.0, h)[..., 0]
+        ends = reference.runge_kutta_step(method, acceleration, q, qd, 0.0, h)[..., 0]
         return float(np.max(np.abs(np.linalg.eigvals(ends))))
 
     for limit, force in ((undamped, lambda q, qd, t: -q), (decay, lambda q, qd, t: -qd)):

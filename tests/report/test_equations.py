@@ -26,7 +26,7 @@ from eomc.model.symbols import symbol
 from eomc.report.equations import derive
 from eomc.report.equations_text import write_equations
 from eomc.report.typeset import Typesetter
-from eomc.runtime.labels import tex
+from eomc.runtime.plot import tex
 from eomc.verify import symbolic
 
 ALL = sorted(SCENES.glob("*.toml"))

@@ -13,7 +13,7 @@ from eomc.base.errors import EomcError
 from eomc.base.names import GREEK
 from eomc.model.system import Input, Output, System, from_scene, symbol
 from eomc.report import plot
-from eomc.runtime.labels import mathtext
+from eomc.runtime.plot import mathtext
 from eomc.scene.read import read
 
 pytest.importorskip("matplotlib")

@@ -16,8 +16,7 @@ import numpy as np
 import pytest
 from support.session import Modules
 
-from eomc.runtime.labels import mathtext, rate_unit
-from eomc.runtime.plot import Curve, broken, grouped, html, wrapped
+from eomc.runtime.plot import Curve, broken, grouped, html, mathtext, rate_unit, wrapped
 
 if importlib.util.find_spec("matplotlib") is None:
     pytest.skip("matplotlib is not installed", allow_module_level=True)

@@ -114,7 +114,7 @@ def test_build_that_cannot_be_moved_leaves_all_files_unchanged(
     """Header, C, Python's files and library are unchanged, whichever of them the move fails at."""
     folder, move, moved_files = root / "simple_pendulum", os.replace, list[str]()
     (folder / "_runtime" / "status.py").write_text("of another version", encoding="utf-8")
-    (folder / "_runtime" / "events.py").unlink()  # the previous build had no such file
+    (folder / "_runtime" / "statics.py").unlink()  # the previous build had no such file
     before, last = contents(folder), ""
 
     def failing_replace(old: Path, new: Path) -> None:

@@ -42,7 +42,7 @@ from eomc.report.typeset import (
     write_latex,
     write_text,
 )
-from eomc.runtime.labels import tex
+from eomc.runtime.plot import tex
 
 MAX_DEFINITIONS = 60  # definitions that are shown
 LINES_PER_ENVIRONMENT = 40  # joints that fill a page

@@ -23,8 +23,17 @@ from eomc.base.errors import EomcError, writing
 from eomc.model.system import Coordinate, Output, System
 from eomc.report.drawing import TRAVEL_LIMIT, Drawing, Mark, draw_mechanism, find_system
 from eomc.runtime.atomic_write import atomic_write
-from eomc.runtime.labels import mathtext, of_words, rate_unit, with_unit
-from eomc.runtime.plot import MAX_ROWS, Curve, Source, against, grouped
+from eomc.runtime.plot import (
+    MAX_ROWS,
+    Curve,
+    Source,
+    against,
+    grouped,
+    mathtext,
+    of_words,
+    rate_unit,
+    with_unit,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

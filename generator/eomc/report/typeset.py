@@ -28,7 +28,7 @@ from sympy.printing.str import StrPrinter
 
 from eomc.base.errors import EomcError
 from eomc.model.system import System, symbol, t
-from eomc.runtime.labels import tex
+from eomc.runtime.plot import tex
 
 MIN_DECIMAL_DENOMINATOR = 20  # smaller denominators are shown as fractions
 DOTS = ("", "\N{DOT ABOVE}", "\N{DIAERESIS}")  # appended to names of several letters

@@ -29,7 +29,7 @@ from .arguments import (
     without_mask,
 )
 from .batch_trajectory import COUNTERS, BatchTrajectory
-from .events import BatchEventBuffer
+from .columns import BatchEventBuffer
 from .info import next_chunk
 from .integration import MIN_CHECKED_NUMBERS, new_options, room_for
 from .interfaces import CompiledBatchModel

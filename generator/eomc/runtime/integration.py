@@ -14,7 +14,7 @@ import numpy as np
 from numpy import empty, ndarray
 
 from .arguments import Array, machine_memory
-from .events import EventBuffer
+from .columns import EventBuffer
 from .info import next_chunk
 from .interfaces import CompiledModel
 from .requests import (

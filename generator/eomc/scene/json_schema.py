@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from eomc.scene import schema
-from eomc.scene.repeat import TABLES
+from eomc.scene.read import TABLES
 from eomc.scene.schema import Key
 from eomc.scene.toml_text import ARRAYS
 from eomc.scene.value_types import entry

@@ -28,7 +28,7 @@ import numpy as np
 
 from eomc.integrators.tableaux import METHODS, RK4
 from eomc.runtime import rank
-from eomc.verify import one_step
+from eomc.verify import reference
 from eomc.verify.comparison import Check, Comparison, Measurement
 from eomc.verify.reference import Vector, differences
 from eomc.verify.sampling import EPS, MAX_DISTANCE, NUDGE, Expected, State, states_of_run
@@ -283,7 +283,7 @@ class Convergence:
         x, h = np.array([s.q, s.qd]), span / steps
         with np.errstate(all="ignore"):
             for k in range(steps):
-                x = one_step.step(RK4, acceleration, x[0], x[1], s.t + k * h, h)
+                x = reference.runge_kutta_step(RK4, acceleration, x[0], x[1], s.t + k * h, h)
         return x / self.scale if np.isfinite(x).all() else None
 
     def _ladder(self, at: Expected, end: _End, span: float) -> _Ladder | None:

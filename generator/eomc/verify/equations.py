@@ -3,7 +3,7 @@
 Values are compared with those of the reference. A law (symmetry, bias = C q̇ + g) is tested on the
 module alone, whatever the reference returns. Derivatives of accelerations (`linearize`,
 `sensitivity`) and of steps (`discretize`) are compared with difference quotients of order 8: of the
-reference's accelerations, and of steps by the method's tableau (`one_step`) on these accelerations.
+reference's accelerations, and of steps by the method's tableau on these accelerations.
 Under constraints the reference projects the ends of the steps onto the constraints.
 """
 
@@ -18,9 +18,8 @@ from typing import Any
 import numpy as np
 
 from eomc.integrators.tableaux import METHODS
-from eomc.verify import one_step
 from eomc.verify.comparison import LIMIT, Check, Comparison, Values
-from eomc.verify.reference import ReferenceModel, Vector, differences
+from eomc.verify.reference import ReferenceModel, Vector, differences, runge_kutta_step
 from eomc.verify.sampling import (
     MAX_DISTANCE,
     NUDGE,
@@ -401,7 +400,7 @@ def _step_differences(of: Comparison, method: str, s: State, h: float, by: Vecto
                 u = rows[:, 2 * n :] + (own if s.u is None else s.u)
             return reference.acceleration(q, qd, now, u, s.params)
 
-        q, qd = one_step.step(
+        q, qd = runge_kutta_step(
             METHODS[method], acceleration, rows[:, :n], rows[:, n : 2 * n], s.t, h
         )
         if of.system.constraints:

@@ -1,8 +1,8 @@
 """Checks of steps and runs: with fixed steps, with adaptive steps, and with events.
 
-A step of any method is compared with a step of its tableau on the reference's accelerations
-(`one_step`), and a run row by row: each row must be one such step from the row before. A run may
-compute a step in other ways than `step` does, with predicted sines and compensated sums.
+A step of any method is compared with a step of its tableau on the reference's accelerations,
+and a run row by row: each row must be one such step from the row before. A run may compute a step
+in other ways than `step` does, with predicted sines and compensated sums.
 
 Each adaptive step may have an error of the tolerance, times the growth of a difference of the
 initial state. The expected states are those of two steps of the tableau for each step of a run with
@@ -27,7 +27,7 @@ import numpy as np
 from eomc.integrators.tableaux import GAUSS16, METHODS
 from eomc.model.symbols import Output
 from eomc.runtime.package import model_of
-from eomc.verify import one_step
+from eomc.verify import reference
 from eomc.verify.comparison import LIMIT, Check, Comparison
 from eomc.verify.outputs import Formulas, output_error
 from eomc.verify.reference import Vector
@@ -83,7 +83,7 @@ def expected_step(of: Comparison, method: str, e: Expected, h: float) -> tuple[V
         def acceleration(q: Vector, qd: Vector, t: Vector) -> Vector:
             return of.reference.acceleration(q, qd, t, **arguments)
 
-        ends = one_step.step(m, acceleration, q, qd, t, h)
+        ends = reference.runge_kutta_step(m, acceleration, q, qd, t, h)
         if of.system.constraints:
             ends = np.array(
                 of.reference.corrected(ends[0], ends[1], t + h, arguments.get("params"))
@@ -318,9 +318,9 @@ def accurate_states(of: Comparison, s: State, times: Vector, grid: Vector) -> tu
             h = (end - t) / 2
             for k in range(2):
                 state = q, qd, t + k * h, h
-                end_state = one_step.step(GAUSS16, acceleration, *state)
+                end_state = reference.runge_kutta_step(GAUSS16, acceleration, *state)
                 if not np.isfinite(end_state).all():  # fixed-point iteration diverges
-                    end_state, _ = one_step.step_by_newton(GAUSS16, acceleration, *state)
+                    end_state, _ = reference.step_by_newton(GAUSS16, acceleration, *state)
                 q, qd = end_state
             t = float(end)
             if end in times:

@@ -17,7 +17,7 @@ import numpy as np
 
 from eomc.integrators.tableaux import METHODS
 from eomc.runtime.package import model_of
-from eomc.verify import one_step
+from eomc.verify import reference
 from eomc.verify.comparison import Check, Comparison, Measurement
 from eomc.verify.reference import Vector
 from eomc.verify.sampling import State
@@ -105,13 +105,13 @@ class NewtonChecks:
         """
         m, s = METHODS[method], place.start
         # fixed-point iteration with this factor converges in fewer than 20 iterations
-        if one_step.contraction_factor(m, place.slopes, h) < 1 / 7:
+        if reference.contraction_factor(m, place.slopes, h) < 1 / 7:
             return None
         x, counts = np.array([s.q, s.qd]), []
         rows = [x]
         for n in range(STEPS):
             with np.errstate(all="ignore"):
-                x, count = one_step.step_by_newton(
+                x, count = reference.step_by_newton(
                     m, self.accelerations, x[0], x[1], s.t + n * h, h
                 )
             far = np.abs(x - [place.centre.q, place.centre.qd]) / self.reach(place)
@@ -152,7 +152,7 @@ class NewtonChecks:
         with np.errstate(all="ignore"):
             for _ in range(40):
                 a = self.accelerations(q[None], rest[None], np.array([s.t]))[0]
-                slopes = one_step.slopes(self.accelerations, q, rest, s.t, self.scale)
+                slopes = reference.acceleration_slopes(self.accelerations, q, rest, s.t, self.scale)
                 if not (np.all(np.isfinite(a)) and np.all(np.isfinite(slopes))):
                     return None
                 step = np.linalg.lstsq(slopes[:, :n], -a, rcond=1e-10)[0]
