@@ -237,7 +237,8 @@ def test_page_is_written_without_matplotlib_and_latex2mathml(
     for name in ("matplotlib", "matplotlib.figure", "latex2mathml", "latex2mathml.converter"):
         monkeypatch.setitem(sys.modules, name, None)
     typeset._convert_to_mathml.cache_clear()
-    monkeypatch.setattr(cost_of_digits, "measure", lambda *_, **__: measured())
+    measurement = measured()
+    monkeypatch.setattr(cost_of_digits, "measure", lambda *_, **__: measurement)
     scene = tmp_path / "oscillating.toml"
     scene.write_text(OSCILLATING)
     (tmp_path / "oscillating").mkdir()

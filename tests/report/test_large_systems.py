@@ -26,6 +26,7 @@ from eomc.model.tree import Tree
 from eomc.report import equations_text
 from eomc.report.equations import Equations, derive
 from eomc.report.equations_text import write_equations
+from eomc.report.typeset import CONTINUATION, MAX_ENVIRONMENT_LENGTH
 from eomc.scene.read import parse
 from eomc.verify import symbolic
 
@@ -299,3 +300,13 @@ def test_latex_of_every_scene_compiles_in_katex(which: str, tmp_path: Path) -> N
     )  # fmt: skip
     assert process.returncode == 0, process.stderr
     assert int(process.stdout) == sum(map(len, parts.values())) > 2 * len(systems)
+
+
+def test_long_equations_get_an_environment_of_their_own() -> None:
+    """KaTeX accepts about a page, and the equations of this scene fill two."""
+    latex = write_equations(from_scene(parse(EVERYTHING, "test.toml")), "latex")
+    environments = latex.split(r"\end{align*}")[:-1]
+    for text in environments:
+        equations = [line for line in text.splitlines() if not line.startswith(CONTINUATION)]
+        assert len(text) < MAX_ENVIRONMENT_LENGTH + 100 or len(equations) <= 2  # \begin and one
+    assert r"\operatorname{expm1}" in latex

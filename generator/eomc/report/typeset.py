@@ -398,15 +398,16 @@ def write_text(equations: Iterable[Equation]) -> list[str]:
 def write_latex(groups: Iterable[Sequence[Equation]]) -> str:
     """Return equations as LaTeX: one align* environment of amsmath, or several, for each group.
 
-    Each environment has about MAX_ENVIRONMENT_LENGTH characters at most.
+    An environment has at most MAX_ENVIRONMENT_LENGTH characters, unless one equation has more.
     """
     bodies: list[list[str]] = []
     for group in groups:
         bodies.append([])
         for entry in (entry for each in group for entry in each.entries()):
-            if sum(map(len, bodies[-1])) > MAX_ENVIRONMENT_LENGTH:
+            lines = entry.latex_lines()
+            if bodies[-1] and sum(map(len, bodies[-1] + lines)) > MAX_ENVIRONMENT_LENGTH:
                 bodies.append([])
-            bodies[-1] += entry.latex_lines()
+            bodies[-1] += lines
     return align(bodies)
 
 
@@ -610,6 +611,9 @@ class _LatexPrinter(LatexPrinter):  # type: ignore[misc]
         settings = {"order": "none", "fold_func_brackets": True, "full_prec": False}
         super().__init__(settings | ({"mul_symbol": r" \, "} if words else {}))
         self._names = names
+
+    def _hprint_Function(self, func: str) -> str:
+        return r"\operatorname{expm1}" if func == "expm1" else str(super()._hprint_Function(func))
 
     def _print_Symbol(self, e: Symbol, style: str = "plain") -> str:
         return self._names.get(e) or tex(e.name)
