@@ -612,8 +612,9 @@ class _LatexPrinter(LatexPrinter):  # type: ignore[misc]
         super().__init__(settings | ({"mul_symbol": r" \, "} if words else {}))
         self._names = names
 
-    def _hprint_Function(self, func: str) -> str:
-        return r"\operatorname{expm1}" if func == "expm1" else str(super()._hprint_Function(func))
+    def doprint(self, expr: Expr) -> str:
+        # SymPy makes a subscript of a digit at the end of a name
+        return str(super().doprint(expr)).replace("{expm}_{1}", "{expm1}")
 
     def _print_Symbol(self, e: Symbol, style: str = "plain") -> str:
         return self._names.get(e) or tex(e.name)
