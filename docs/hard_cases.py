@@ -1,6 +1,6 @@
-"""Writes docs/hard-cases.md: every case of tests/data/cases.json, its best stepper and its error.
+"""Write docs/hard-cases.md: the best integration method and its error for each case of tests/data/cases.json.
 
-python docs/hard_cases.py [CASE...]      the table of all, or those cases printed
+python docs/hard_cases.py [CASE...]      write the table, or print the rows of these cases
 """
 
 from __future__ import annotations
@@ -18,29 +18,32 @@ ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
 
 import numpy as np  # noqa: E402
-from cases import case_system, cases  # noqa: E402
+from support.cases import case_system, cases  # noqa: E402
 
 from eomc.base.errors import EomcError  # noqa: E402
 from eomc.integrators.tableaux import METHODS  # noqa: E402
 from eomc.report import cost_of_digits  # noqa: E402
 
-LONGEST = 0.5  # s of computing of one run
-LONG = 4  # times that, while fewer than six digits are found
-PATIENCE = 3  # halvings of h in a row that may bring nothing, once an error is small
-LEAST_ORDER = 4  # lower ones are no way to many digits
-LUCK = 10.0  # times worse with half the step: then an error was small by chance
-NEAR = 3.0  # times the smallest error or the floor: the quickest run of those counts
+LONGEST = 0.5  # s, computing time of one run
+LONG = 4  # factor of LONGEST while fewer than six digits are correct
+PATIENCE = 3  # consecutive halvings of h without improvement, once an error is small
+LEAST_ORDER = 4  # methods of lower order do not reach many digits
+LUCK = 10.0  # an error that grows by this factor with half the step was small by chance
+NEAR = 3.0  # the fastest run within this factor of the smallest error or the floor is shown
 
 INTRODUCTION = """# Hard cases
 
-Every case of `tests/data/cases.json` without constraints, run with every stepper of order 4 and
-more that it can use, at h = t_end/2^k, as far as {longest:g} s of computing go. Shown is the
-quickest run whose error is within a factor of {near:g} of the smallest, or of the floor where that
-is larger, runs left out that half the step makes much worse. Error: max |q - q_ref|/max(1, max
-|q_ref|) at the end, against 30 digits. Floor: what rounding of the start alone makes of it in
-doubles (`double_floor`). Evaluations: of accelerations, those of every sweep of an iteration
-counted. Computing: of one run on two shared cores, x86-64. Which cases come within ten times the
-floor, which do not and why, is in `tests/physics/test_refs.py`.
+Systems with known solutions, and the accuracy of each integration method: every case of `tests/data/cases.json` without
+constraints, with every suitable method of order 4 and more, at h = t_end/2^k, within {longest:g} s of computing time. The
+table shows the fastest run whose error is within a factor of {near:g} of the smallest error, or of the floor if that is
+larger; a run whose error increases much with half the step is left out.
+
+- *Error*: max |q - q_ref|/max(1, max |q_ref|) at the end, compared with a solution of 30 digits.
+- *Floor*: the effect of rounding the initial state to doubles (`double_floor`).
+- *Evaluations*: of the accelerations, including those of every iteration.
+- *Computing time*: of one run on two shared cores, x86-64.
+
+`tests/physics/test_refs.py` lists which cases reach ten times the floor, and why the others do not.
 
 `python docs/hard_cases.py` writes this file.
 
@@ -49,7 +52,7 @@ floor, which do not and why, is in `tests/physics/test_refs.py`.
 
 @dataclass(frozen=True)
 class Best:
-    """The run that counts: its stepper, h and error, what it took."""
+    """The best run of a case: method, step size, error and cost."""
 
     method: str
     h: float
@@ -59,7 +62,7 @@ class Best:
 
 
 def best(name: str) -> Best | None:
-    """The quickest run near the smallest error or the floor; None: none gets to the end."""
+    """Return the fastest run near the smallest error or the floor; None if no run reaches the end."""
     case = cases()[name]
     system = case_system(name)
     methods = tuple(m.name for m in METHODS.values() if m.order >= LEAST_ORDER)
@@ -99,7 +102,7 @@ def _runs(module: ModuleType, method: str, case: dict[str, Any]) -> list[Best]:
 
 
 def row(name: str) -> str:
-    """The case as a row of the table."""
+    """Return the row of a case in the table."""
     floor = cases()[name]["double_floor"]
     told = "-" if floor is None else f"{floor:.1e}"
     try:
@@ -107,7 +110,7 @@ def row(name: str) -> str:
     except EomcError as fault:
         return f"| {name} | {str(fault).splitlines()[0]} | | | {told} | | |"
     if found is None:
-        return f"| {name} | none gets to the end in {LONGEST:g} s | | | {told} | | |"
+        return f"| {name} | no run reaches the end in {LONGEST:g} s | | | {told} | | |"
     return (
         f"| {name} | {found.method} | {found.h:.3g} | {found.error:.1e} | {told} "
         f"| {found.evaluations} | {found.seconds * 1e3:.3g} ms |"
@@ -115,7 +118,7 @@ def row(name: str) -> str:
 
 
 def main(wanted: list[str]) -> None:
-    """Print rows as they are made; write the file where all are."""
+    """Print each row; write the file if all cases are run."""
     known = [name for name, case in cases().items() if not case["constraints"]]
     rows = []
     for name in wanted or known:
@@ -123,7 +126,7 @@ def main(wanted: list[str]) -> None:
         print(rows[-1], flush=True)
     if wanted:
         return
-    head = "| case | stepper | h, s | error | floor | evaluations | computing |\n"
+    head = "| case | method | h, s | error | floor | evaluations | computing time |\n"
     text = INTRODUCTION.format(longest=LONGEST, near=NEAR) + head
     text += "|---|---|---|---|---|---|---|\n" + "\n".join(rows) + "\n"
     (ROOT / "docs" / "hard-cases.md").write_text(text, encoding="utf-8")
