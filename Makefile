@@ -1,5 +1,6 @@
 # make demo    set up, build and check the cart-pole scenes, run one, draw it
 # make test    set up, run the quick tests
+# make docs    the site of the documentation, build/docs/index.html; warnings are errors
 # make bench   against others (an environment of 2.6 GB, a C++ compiler); writes benchmarks/*.md
 # make wheel   a wheel and an sdist into dist/
 # make fuzz    attacks the readers of text, without end; finds go to build/hostile/finds
@@ -19,7 +20,7 @@ export PYTHONPYCACHEPREFIX := $(CURDIR)/build/pycache
 # some shells forbid bytecode: every command then takes four seconds to start, instead of 0.7
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo wheel test test-all test-slow fuzz endurance lint golden bench clean
+.PHONY: demo docs wheel test test-all test-slow fuzz endurance lint golden bench clean
 
 demo: .venv/demo
 	@$(BIN)/eomc build $(DEMO)
@@ -33,6 +34,11 @@ demo: .venv/demo
 	@echo "the C to embed:      build/cartpole/cartpole.h, build/cartpole/cartpole.c"
 	@echo "the Python module:   PYTHONPATH=build $(BIN)/python -c 'import cartpole; print(cartpole.simulate())'"
 	@echo "the command:         $(BIN)/eomc --help"
+
+# pictures of the gallery are drawn when their scenes change
+docs: .venv/docs
+	$(BIN)/python -m sphinx -W --keep-going -q -b html -d build/docs-cache docs build/docs
+	@echo "the site:   build/docs/index.html"
 
 wheel: .venv/bin/python
 	@$(INSTALL) "hatchling>=1.26"
@@ -121,6 +127,10 @@ clean:
 .venv/dev: pyproject.toml .venv/bin/python
 	$(INSTALL) --editable ".[dev]"
 	@touch $@ .venv/test .venv/demo
+
+.venv/docs: pyproject.toml .venv/bin/python
+	$(INSTALL) --editable ".[docs]"
+	@touch $@
 
 # half a gigabyte of robots, the simulator that they are held against, compilers for other machines,
 # importers of units of FMI, Dask for sweeps

@@ -43,7 +43,7 @@ class Estimate:
     Attributes
     ----------
     q, qd : (n, nq) arrays
-        Estimates of |q - exact| and |qd - exact| at every row of the run, in the units of the
+        Estimates of the absolute errors of q and qd at every row of the run, in the units of the
         coordinates and per s; inf where a run with shorter steps stopped before the row.
     end : dict
         The same estimates at the last row, by name; velocities have names such as "theta_dot".
@@ -58,9 +58,9 @@ class Estimate:
     amplification : float
         Largest factor by which the motion multiplies a small difference of the initial states until
         the end of the run. It is 1 for a harmonic oscillator. It is a lower bound if the difference
-        becomes as large as the motion itself. The norm of a difference d = [dq; dqd] is
-        |d|^2 = dqd' D dqd + (dq/T)' D (dq/T) with the mean mass matrix D and the times
-        T = |dq|/|dqd| (docs/python.md).
+        becomes as large as the motion itself. The square of the norm of a difference [dq; dqd]
+        is dqd' D dqd + (dq/T)' D (dq/T) with the mean mass matrix D and the times
+        T = norm(dq)/norm(dqd) (docs/python.md).
     verdict : str
         The reasons why the motion is not resolved; "" if it is resolved.
     events : mapping

@@ -1,0 +1,127 @@
+"""Extension of Sphinx for the site of eomc.
+
+- The pages of a section are those that its page lists, `- [title](page.md): ...`. The lists are
+  read on code-hosting sites too, which show no `toctree`.
+- Links to files of the repository that are no pages of the site become their paths.
+- Directives write what is generated: `scene-keys`, `gallery` and `c-functions`.
+- Formulas are MathML, which needs no script.
+"""
+
+from __future__ import annotations
+
+import os
+import posixpath
+import re
+from pathlib import Path
+from typing import Any
+
+from docutils import nodes
+from scene_pages import describe_c_functions, describe_keys, describe_scenes
+from sphinx.application import Sphinx
+from sphinx.util.docutils import SphinxDirective
+
+ROOT = Path(__file__).parents[2]
+SECTIONS = ("README", "tutorials", "how-to", "reference", "explanation")
+LISTED = re.compile(r"^- \[[^\]]*\]\((?!\.\.)([^)#:]+)\.(?:md|ipynb)\)", re.MULTILINE)
+LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s#:]+)(#[^)\s]*)?\)")
+CODE = re.compile(r"(^```.*?^```)", re.MULTILINE | re.DOTALL)
+
+
+def read_page(app: Sphinx, page: str, source: list[str]) -> None:
+    """Add the list of a section's pages to the navigation, and replace links to files."""
+    pages = LISTED.findall(source[0])
+    parts = CODE.split(source[0])
+    parts[::2] = [LINK.sub(lambda match: _link(app, page, match), part) for part in parts[::2]]
+    source[0] = "".join(parts)
+    if page in SECTIONS:
+        listed = "\n".join(f"/{posixpath.normpath(one)}" for one in pages)
+        source[0] += f"\n\n```{{toctree}}\n:hidden:\n\n{listed}\n```\n"
+
+
+def _link(app: Sphinx, page: str, match: re.Match[str]) -> str:
+    """Return a link as it is, or the text and path of a file that is no page of the site."""
+    image, words, target, _ = match.groups()
+    path = Path(os.path.normpath(Path(app.srcdir, page).parent / target))
+    inside = path.is_relative_to(app.srcdir) and app.project.path2doc(str(path)) is not None
+    if image or (inside and path.suffix in (".md", ".ipynb")):
+        return match[0]
+    shown = path.relative_to(ROOT).as_posix() + ("/" if path.is_dir() else "")
+    if words.strip("`").rstrip("/").endswith(Path(shown).name):
+        return f"`{shown}`"
+    return f"{words} (`{shown}`)"
+
+
+class Generated(SphinxDirective):
+    """Directive that parses generated text as a part of its page."""
+
+    has_content = False
+    optional_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        """Return the nodes of the generated text."""
+        return self.parse_text_to_nodes(self.text(), allow_section_headings=True)
+
+    def text(self) -> str:
+        """Return the text, in the markup of the page."""
+        raise NotImplementedError
+
+
+class SceneKeys(Generated):
+    """Tables of the keys of a scene, from the schema."""
+
+    def text(self) -> str:
+        """Return the tables as Markdown."""
+        return describe_keys()
+
+
+class Gallery(Generated):
+    """A picture, the equations and the code of each scene that comes with eomc."""
+
+    def text(self) -> str:
+        """Return a section for each scene; pictures are drawn into a folder of the output."""
+        pictures = Path(self.env.app.outdir) / "_images" / "gallery"
+        return describe_scenes(ROOT / "build" / "docs-modules", pictures)
+
+
+class CFunctions(Generated):
+    """The C functions and types of the header of a scene."""
+
+    required_arguments, optional_arguments = 1, 0
+
+    def text(self) -> str:
+        """Return a section for each function of the header."""
+        self.env.note_dependency(path := str(Path(self.env.srcdir) / self.arguments[0]))
+        return describe_c_functions(Path(path))
+
+
+def show_examples(app: Sphinx, context: Any, lines: list[str]) -> None:
+    """Set the lines of examples in the help of a command as code."""
+    lines[:] = [re.sub(r"^\| (?=\S)(.*)$", r"| ``\1``", line) for line in lines]
+
+
+def visit_math(writer: Any, node: nodes.math | nodes.math_block) -> None:
+    """Write a formula as MathML."""
+    from latex2mathml.converter import convert
+
+    display = "block" if isinstance(node, nodes.math_block) else "inline"
+    writer.body.append(convert(node.astext(), display=display))
+    raise nodes.SkipNode
+
+
+def write_front_page(app: Sphinx, error: Exception | None) -> None:
+    """Give the first page the name that servers of files expect too."""
+    first = Path(app.outdir) / f"{app.config.root_doc}.html"
+    if error is None and first.is_file():
+        (first.parent / "index.html").write_text(first.read_text(encoding="utf-8"), "utf-8")
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Register the parts of the extension."""
+    app.connect("source-read", read_page)
+    app.connect("sphinx-click-process-description", show_examples)
+    app.connect("build-finished", write_front_page)
+    app.add_directive("scene-keys", SceneKeys)
+    app.add_directive("gallery", Gallery)
+    app.add_directive("c-functions", CFunctions)
+    app.add_html_math_renderer("mathml", (visit_math, None), (visit_math, None))
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
