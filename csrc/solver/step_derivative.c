@@ -1,16 +1,16 @@
 /*
  * Derivatives of a step of a Runge-Kutta method by the chain rule over its stages (Hairer, Norsett & Wanner, Solving
- * ODEs I, sec. I.14), with respect to the variables [q, qd, u] at its start: W = EOM_VARIABLES of them. Matrices of
- * derivatives have W columns. Those of the accelerations at the stages, X, have NQ rows for each stage.
+ * ODEs I, sec. I.14), with respect to W = EOM_VARIABLES variables: q and qd at its start, the inputs u, and the parameters p
+ * of scenes that request them. Matrices of derivatives have W columns. Those of the accelerations at the stages, X, have
+ * NQ rows for each stage.
  */
 
-#if EOM_INPUTS
-/* J = [da/dq, da/dqd, da/du] of the accelerations a. */
-#else
-/* J = [da/dq, da/dqd] of the accelerations a. */
-#endif
+/* J = the derivatives of the accelerations with respect to the variables. */
 #if EOM_FEEDBACK
 /* If u is NULL, feedback by the scene's signals is included. */
+#endif
+#if EOM_SIGNAL_PARAMETERS
+/* If u is NULL, the parameters of the scene's signals are included. */
 #endif
 static eom_status eom_differentiate_accelerations(real *J, const real *q, const real *qd, real t, const eom_model *m)
 {
@@ -26,6 +26,13 @@ static eom_status eom_differentiate_accelerations(real *J, const real *q, const 
 #if EOM_FEEDBACK
     real K[NU*2*NQ];
 #endif
+#if EOM_PARAMETERS
+    enum { NP = EOM_NP };
+    real E[NQ*NP];
+#endif
+#if EOM_SIGNAL_PARAMETERS
+    real u_p[NU*NP];
+#endif
 
     if (status)
         return status;
@@ -39,6 +46,12 @@ static eom_status eom_differentiate_accelerations(real *J, const real *q, const 
             J[W*i + 2*NQ + j] = B[NU*i + j];
 #endif
     }
+#if EOM_PARAMETERS
+    eom_evaluate_parameter_derivatives(E, q, qd, t, m);
+    for (int i = 0; i < NQ; i++)
+        for (int j = 0; j < NP; j++)
+            J[W*i + W - NP + j] = E[NP*i + j];
+#endif
 #if EOM_FEEDBACK
     if (!m->u) {
         eom_evaluate_signal_derivatives(K, q, qd, t, m);
@@ -46,6 +59,15 @@ static eom_status eom_differentiate_accelerations(real *J, const real *q, const 
             for (int j = 0; j < 2*NQ; j++)
                 for (int k = 0; k < NU; k++)
                     J[W*i + j] += B[NU*i + k]*K[2*NQ*k + j];
+    }
+#endif
+#if EOM_SIGNAL_PARAMETERS
+    if (!m->u) {
+        eom_evaluate_signal_sensitivity(u_p, q, qd, t, m);
+        for (int i = 0; i < NQ; i++)
+            for (int j = 0; j < NP; j++)
+                for (int k = 0; k < NU; k++)
+                    J[W*i + W - NP + j] += B[NU*i + k]*u_p[NP*k + j];
     }
 #endif
     return EOM_OK;
@@ -264,15 +286,15 @@ static eom_status eom_project_derivatives(real *X, real *r, real *v, const real 
     enum { NQ = EOM_NQ, W = EOM_VARIABLES, MAX_PASSES = 12 };
     /* as in eom_apply_correction: bounds of squares, and weight of the increment */
     static const real SMALL = 8*EOM_EPS, ZERO = (real)1e-12, STEP_WEIGHT = 100;
-    real along[2*NQ], column[4*NQ];
+    real along[W], column[4*NQ];
 
     for (int pass = 0, left = 2; pass < MAX_PASSES && left; pass++) {
         real total = 0;
         int is_large = 0;
 
         for (int w = 0; w < W; w++) {
-            for (int i = 0; i < 2*NQ; i++)
-                along[i] = X[W*i + w];
+            for (int i = 0; i < W; i++)
+                along[i] = i < 2*NQ ? X[W*i + w] : (real)(i == w);
             if (eom_evaluate_correction_along(column, along, r, v, t, m))
                 return EOM_SINGULAR;
             for (int i = 0; i < 2*NQ; i++)
@@ -307,27 +329,14 @@ static int eom_ends_differ(const real *r, const real *v, const real *at, const r
     return distance > OTHER_SOLUTION*scale;
 }
 
-#if EOM_INPUTS
-/* Phi, Gamma = the columns of `ends` for [q, qd] and for u, if all are finite. */
-static eom_status eom_store_derivatives(real *Phi, real *Gamma, const real *ends)
-#else
-/* Phi = `ends`, if all are finite. */
-static eom_status eom_store_derivatives(real *Phi, const real *ends)
-#endif
+/* to = columns of the derivatives of the end of a step, (2 NQ, count). */
+static void eom_copy_columns(real *to, const real *ends, int first, int count)
 {
-    enum { NQ = EOM_NQ, W = EOM_VARIABLES };
+    enum { W = EOM_VARIABLES };
 
-    if (!eom_finite(ends, 2*NQ*W))
-        return EOM_NOT_FINITE;
-    for (int k = 0; k < 2*NQ; k++) {
-        for (int w = 0; w < 2*NQ; w++)
-            Phi[2*NQ*k + w] = ends[W*k + w];
-#if EOM_INPUTS
-        for (int w = 2*NQ; w < W; w++)
-            Gamma[(W - 2*NQ)*k + w - 2*NQ] = ends[W*k + w];
-#endif
-    }
-    return EOM_OK;
+    for (int k = 0; k < 2*EOM_NQ; k++)
+        for (int w = 0; w < count; w++)
+            to[count*k + w] = ends[W*k + first + w];
 }
 
 #if EOM_CONSTRAINTS

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from types import ModuleType
 from typing import Any
 
@@ -37,6 +38,7 @@ y = "-y_dot*x"
 [run]
 h = 0.02
 discretize = true
+linearize = "parameters"
 method = ["rk4", "dp8", "gauss4", "gauss16"]
 """
 SLEIGH = """eomc = 1
@@ -103,6 +105,10 @@ def difference_quotients(step: Any, x: Any, width: float = 2e-3) -> Any:
     ).T
 
 
+def compose(outer: Any, inner: Any) -> Any:
+    return lambda x: outer(inner(x))
+
+
 @pytest.mark.parametrize("inputs", INPUTS)
 @pytest.mark.parametrize(
     ("text", "method"), tiers(CASES, CASES[0], *CASES[-2:]), ids=lambda x: x[-9:].strip()
@@ -129,6 +135,13 @@ def test_derivatives_equal_differences_of_steps(
             _, Gamma = m.discretize(q, qd, h, t, u, method=method)
             np.testing.assert_allclose(Gamma, expected, rtol=0, atol=2e-12)
             assert np.abs(Gamma).max() > 1e-3
+        if m.parameters:
+            start = np.split(x, 2)
+            step = partial(m.step, *start, h, t, u, method=method)
+            expected = difference_quotients(compose(np.hstack, step), model_of(m).info.p0)
+            E = m.discretize(*start, h, t, u, method=method, parameters=True)[-1]
+            np.testing.assert_allclose(E, expected, rtol=0, atol=2e-11)
+            assert np.abs(E[:, 1]).max() > 0.1
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,7 @@ lean = "sin(theta + x)"
 [energy]
 kinetic = "x_dot**2 + x_dot*theta_dot*cos(theta) + theta_dot**2"
 potential = "9.81*cos(theta) + k*x**2"
-dissipation = "theta_dot**2/5"
+dissipation = "k*theta_dot**2/20"
 [forces]
 x = "force"
 theta = "push*cos(x)"
@@ -46,8 +46,9 @@ theta = "push*cos(x)"
 h = 0.02
 """
 )
-EXPLICIT = LOOP + 'discretize = true\nmethod = ["rk4", "dp8", "euler"]\nbatch = true\n'
-IMPLICIT = LOOP + 'discretize = true\nmethod = ["gauss4", "gauss6", "gauss8", "gauss16"]\n'
+DERIVATIVES = 'discretize = true\nlinearize = "parameters"\n'
+EXPLICIT = LOOP + DERIVATIVES + 'method = ["rk4", "dp8", "euler"]\nbatch = true\n'
+IMPLICIT = LOOP + DERIVATIVES + 'method = ["gauss4", "gauss6", "gauss8", "gauss16"]\n'
 NYSTROM = (
     HEAD.replace("NAME", "nystrom")
     + """force = { unit = "N", signal = "k*theta - x**3" }
@@ -85,23 +86,21 @@ class ExactStepper:
             for expressions in (r.motion, r.signals)
         )
 
-    def acceleration(self, q: Any, qd: Any, t: Any, u: Any, added: Any) -> Any:
+    def acceleration(self, q: Any, qd: Any, t: Any, u: Any, added: Any, p: Any) -> Any:
         """Return the acceleration; u is constant, or None for the signals, plus `added`."""
         n = self.n
         if u is None:
-            u = self.signals(*q, *qd, t, *[0] * self.m, *self.values)
-        values = self.motion(
-            *q, *qd, t, *(a + b for a, b in zip(u, added, strict=True)), *self.values
-        )
+            u = self.signals(*q, *qd, t, *[0] * self.m, *p)
+        values = self.motion(*q, *qd, t, *(a + b for a, b in zip(u, added, strict=True)), *p)
         D, bias, tau = values[: n * n], values[n * n : -n], values[-n:]
         matrix = mpmath.matrix([D[n * i : n * i + n] for i in range(n)])
         force = mpmath.matrix([a - b for a, b in zip(tau, bias, strict=True)])
         return np.array(mpmath.lu_solve(matrix, force))
 
     def step(self, method: str, z: Any, h: Any, t: Any, u: Any) -> Any:
-        """Return the state a step after z = [q, qd, added]; stages by fixed-point iteration."""
+        """Return the state a step after z = [q, qd, added, p]; stages by fixed-point iteration."""
         m, n = METHODS[method], self.n
-        q, qd, added = z[:n], z[n : 2 * n], z[2 * n :]
+        q, qd, added, p = np.split(z, [n, 2 * n, 2 * n + self.m])
         number = lambda f: mpmath.mpf(f.numerator) / f.denominator  # noqa: E731
         square = [[[number(x) for x in row] for row in rows] for rows in (m.a, m.a_squared)]
         a = np.array([[mpmath.mpf(0)] * n] * m.stages)
@@ -110,7 +109,9 @@ class ExactStepper:
             for i in range(m.stages):
                 v, r = (sum((x * a[j] for j, x in enumerate(rows[i])), 0 * q) for rows in square)
                 c = number(m.c[i])
-                a[i] = self.acceleration(q + c * h * qd + h**2 * r, qd + h * v, t + c * h, u, added)
+                a[i] = self.acceleration(
+                    q + c * h * qd + h**2 * r, qd + h * v, t + c * h, u, added, p
+                )
             if m.implicit and max(abs(x) for x in (a - previous).ravel()) < mpmath.mpf(10) ** -52:
                 break
         else:
@@ -140,11 +141,11 @@ def exact_stepper(text: str) -> ExactStepper:
 
 
 def derivative(text: str, method: str, h: float, t: float, u: Any) -> Any:
-    """Return (Phi, Gamma), accurate to all digits of a double."""
+    """Return [Phi, Gamma, E], accurate to all digits of a double."""
     stepper = exact_stepper(text)
     inputs = None if u is None else [mpmath.mpf(x) for x in u[: stepper.m]]
-    J = stepper.derivative(method, [*Q, *QD, *[0] * stepper.m], h, t, inputs)
-    return J[:, :4], J[:, 4:]
+    J = stepper.derivative(method, [*Q, *QD, *[0] * stepper.m, *stepper.values], h, t, inputs)
+    return np.split(J, [4, 4 + stepper.m], axis=1)
 
 
 def is_quick(method: str, inputs: str) -> bool:
@@ -169,11 +170,14 @@ def test_derivatives_equal_differences_in_many_digits(
     """All digits are right, except the last two of the largest entry."""
     m, u = modules.unoptimised(text), INPUTS[inputs]
     u_scene = None if u is None else u[: len(m.inputs)]
-    Phi, Gamma = m.discretize(Q, QD, 0.03, 0.4, u_scene, method=method)
-    expected, expected_u = derivative(text, method, 0.03, 0.4, u)
+    by_parameters = {"parameters": True} if text is not NYSTROM else {}
+    Phi, Gamma, *E = m.discretize(Q, QD, 0.03, 0.4, u_scene, method=method, **by_parameters)
+    expected, expected_u, expected_p = derivative(text, method, 0.03, 0.4, u)
     assert np.max(np.abs(Phi - expected)) < 4e-15 * np.max(np.abs(expected))
     assert np.max(np.abs(Gamma - expected_u)) < 4e-15 * max(np.max(np.abs(expected_u)), 0.01)
     assert np.any(expected_u) or inputs == "beyond"
+    for by_p in E:
+        assert np.max(np.abs(by_p - expected_p)) < 4e-15 * max(np.max(np.abs(expected_p)), 0.01)
 
 
 @pytest.mark.usefixtures("quickly_compiled")
@@ -183,7 +187,8 @@ def test_portable_c_has_the_same_derivatives(modules: Modules, text: str, tmp_pa
     portable = eomc.load(from_scene(parse(text, "test.toml")), tmp_path, form="plain")
     for method in fast.methods:
         for u in (None, [0.6, -0.4]):
-            results = [m.discretize(Q, QD, 0.03, 0.4, u, method=method) for m in (fast, portable)]
+            options = {"method": method, "parameters": True}
+            results = [m.discretize(Q, QD, 0.03, 0.4, u, **options) for m in (fast, portable)]
             for a, b in zip(*results, strict=True):
                 assert a == pytest.approx(b, rel=1e-13, abs=1e-14)
 
@@ -195,11 +200,12 @@ def test_derivatives_at_many_states_equal_single_ones(
 ) -> None:
     m, options = modules.unoptimised(EXPLICIT), {"params": {"k": 3.0}, "control_period": period}
     q, qd = np.array([Q, 2 * Q, -Q]), np.array([QD, -QD, QD])
-    Phi, Gamma = m.discretize(q, qd, t=t, **options)
-    assert Phi.shape == (3, 4, 4) and Gamma.shape == (3, 4, 2)
+    results = m.discretize(q, qd, t=t, parameters=True, **options)
+    assert [x.shape for x in results] == [(3, 4, 4), (3, 4, 2), (3, 4, 1)]
     for k in range(3):
-        single = m.discretize(q[k], qd[k], t=float(np.broadcast_to(t, 3)[k]), **options)
-        assert np.array_equal(Phi[k], single[0]) and np.array_equal(Gamma[k], single[1])
+        own_t = float(np.broadcast_to(t, 3)[k])
+        single = m.discretize(q[k], qd[k], t=own_t, parameters=True, **options)
+        assert all(np.array_equal(x[k], y) for x, y in zip(results, single, strict=True))
 
 
 @pytest.mark.parametrize("inputs", ["signals", "held"])
@@ -210,10 +216,10 @@ def test_derivative_over_a_control_period_equals_differences_of_runs(
     """Against differences of runs with that period, accurate to about 1e-10."""
     m, u = modules.unoptimised(EXPLICIT), INPUTS[inputs]
     x, options = np.hstack([Q, QD]), {"h": 0.02, "control_period": 0.1, "method": method}
-    Phi, Gamma = m.discretize(Q, QD, u=u, **options)
+    Phi, Gamma, E = m.discretize(Q, QD, u=u, parameters=True, **options)
 
-    def final_state(x: Any, u: Any) -> Any:
-        run = m.simulate(*np.split(x, 2), steps=5, u=u, **options)
+    def final_state(x: Any, u: Any, k: float = 4.0) -> Any:
+        run = m.simulate(*np.split(x, 2), steps=5, u=u, params={"k": k}, **options)
         return run.x[-1]
 
     stencil, width = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280)), 4e-3
@@ -226,6 +232,9 @@ def test_derivative_over_a_control_period_equals_differences_of_runs(
             / width
         )
         assert Phi[:, k] == pytest.approx(expected, abs=1e-9)
+    ends = (w * (final_state(x, u, 4 + j * width) - final_state(x, u, 4 - j * width))
+            for j, w in stencil)  # fmt: skip
+    assert E[:, 0] == pytest.approx(sum(ends) / width, abs=1e-9)
     start = m.signal(Q, QD) if u is None else np.array(u)
     for k, offset in enumerate(width * np.eye(2)):
         ends = (
@@ -294,6 +303,11 @@ def test_invalid_arguments_are_refused(modules: Modules, cartpole: ModuleType) -
     m = modules.unoptimised(EXPLICIT)
     with pytest.raises(ValueError, match=r"cartpole was built without it.*discretize = true"):
         cartpole.discretize([0, 0], [0, 0])
+    nystrom = modules.unoptimised(NYSTROM)
+    with pytest.raises(ValueError, match=r"discretize: nystrom .*linearize = \"parameters\""):
+        nystrom.discretize(Q, QD, parameters=True)
+    with pytest.raises(ValueError, match="parameters: 1 is not True or False"):
+        m.discretize(Q, QD, parameters=1)
     with pytest.raises(ValueError, match="'gauss4' is not in this module"):
         m.discretize(Q, QD, method="gauss4")
     with pytest.raises(ValueError, match="give a whole number of steps"):
@@ -347,11 +361,15 @@ def test_wrong_derivative_fails_the_check(modules: Modules) -> None:
             return getattr(m, name)
 
         def discretize(self, *state: Any, **options: Any) -> Any:
-            Phi, Gamma = m.discretize(*state, **options)
-            return Phi, Gamma * (1 + 1e-5)
+            matrices = [*m.discretize(*state, **options)]
+            matrices[self.which] *= 1 + 1e-5
+            return matrices
+
+        def __init__(self, which: int) -> None:
+            self.which = which
 
     m, scene_system = modules.unoptimised(EXPLICIT), from_scene(parse(EXPLICIT, "test.toml"))
-    for module, passed in ((m, True), (PerturbedModule(), False)):
+    for module, passed in ((m, True), (PerturbedModule(1), False), (PerturbedModule(2), False)):
         comparison = Comparison(scene_system, module, np.random.default_rng(0), 4)
         results = comparison.report(equations.step_derivative_checks)
         assert [row.passed for row in results] == [passed] * 3, results

@@ -55,13 +55,16 @@ class Energies:
     rotation_errors: list[tuple[Expr, Expr]]  # of the constraints that have one
 
 
-def tangent_symbols(system: System) -> dict[Symbol, Symbol]:
+def tangent_symbols(system: System, parameters: bool = False) -> dict[Symbol, Symbol]:
     """Return a symbol for the component of a direction along each coordinate, velocity and input.
 
-    The keys are the symbols of q, qd and u. The values are symbols v_x with which a directional
-    derivative sum_x df/dx v_x is written.
+    The keys are the symbols of q, qd and u, with `parameters` also those of the parameters. The
+    values are symbols v_x with which a directional derivative sum_x df/dx v_x is written.
     """
-    return {x: symbol(f"{x.name}{ALONG}") for x in (*system.q, *system.qd, *system.u)}
+    variables = (*system.q, *system.qd, *system.u)
+    if parameters:
+        variables += tuple(p.symbol for p in system.parameters)
+    return {x: symbol(f"{x.name}{ALONG}") for x in variables}
 
 
 def leaves(system: System, *velocities: Symbol) -> dict[Symbol, Stage]:
@@ -94,7 +97,7 @@ def energies_on_tape(
         If True, formulas on the tape may contain the accelerations `system.qdd`. If False, they may
         contain the components of a direction, see `tangent_symbols`.
     """
-    more = system.qdd if accelerations else tangent_symbols(system).values()
+    more = system.qdd if accelerations else tangent_symbols(system, parameters=True).values()
     tape = Tape(leaves(system, *more), frozenset(system.q) - system.rates.keys())
     rates: dict[Symbol, Expr] = {**system.rates, t: S.One}
     definitions: dict[Symbol, Expr] = {}

@@ -164,14 +164,16 @@ def linearization(system: System, tape: Tape, accelerations: Sequence[Expr]) -> 
 
 
 def directional_derivatives(system: System, tape: Tape, values: Sequence[Expr]) -> Vector:
-    """Return the directional derivative of each of `values`, which depend on q, qd and u.
+    """Return the directional derivative of each of `values`, which depend on q, qd, u and p.
 
-    The direction v has one component for each coordinate, velocity and input; the components are
-    the symbols that `tangent_symbols(system)` returns. The result for a value f is
-    sum_x df/dx v_x over all x in (q, qd, u). The values and results are defined on `tape`, a list
-    of elementary operations. Raises SceneError if a value contains a discontinuous function.
+    The direction v has one component for each coordinate, velocity and input, and for each
+    parameter if the scene requests derivatives with respect to them; the components are the symbols
+    that `tangent_symbols` returns. The result for a value f is sum_x df/dx v_x over all x in
+    (q, qd, u, p). The values and results are defined on `tape`, a list of elementary operations.
+    Raises SceneError if a value contains a discontinuous function.
     """
-    return _slopes(system, tape, values, [tangent_symbols(system)])[0]
+    direction = tangent_symbols(system, parameters=system.run.by_parameters)
+    return _slopes(system, tape, values, [direction])[0]
 
 
 def sensitivity(system: System, tape: Tape, accelerations: Sequence[Expr]) -> Rows:

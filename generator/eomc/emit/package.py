@@ -36,7 +36,7 @@ _PARTS = {
 }  # fmt: skip
 # arrays of the binding with a row for each state
 _ROWS = frozenset(
-    {"q", "qd", "qdd", "along", "qdd_bar", "rates", "bar", "A_q", "A_qd", "B", "Phi", "Gamma"}
+    {"q", "qd", "qdd", "along", "qdd_bar", "rates", "bar", "A_q", "A_qd", "B", "Phi", "Gamma", "E"}
 )
 
 

@@ -716,7 +716,7 @@ class _Cases:
                 yield self.test_function(f"{name}_batch", "batch", call, cases, method)
             if run.discretize:
                 cases = [self.derivative(m, p) for p in points]
-                call = self.call(self.public.derivative(name), Phi="Phi", Gamma="Gamma")
+                call = self.call(self.public.derivative(name), Phi="Phi", Gamma="Gamma", E="E")
                 yield self.test_function(f"{name}_derivative", "derivative", call, cases)
         if self.target.integrates and short:
             yield from self.adaptive_runs()

@@ -250,11 +250,15 @@ def _requested(system: System) -> Iterator[Function]:
 
 
 def _signal_slopes(system: System, functions: Mapping[str, Function]) -> Iterator[Function]:
-    """Yield [du/dq, du/dqd] of signals that depend on the state, where the derivatives exist."""
+    """Yield [du/dq, du/dqd] of signals that depend on the state, where the derivatives exist.
+
+    If derivatives with respect to the parameters are requested, yield du/dp of signals that depend
+    on parameters, too.
+    """
     state = {x.name for x in (*system.q, *system.qd)}
-    if not system.run.needs_derivatives or not (
-        "signal" in functions and functions["signal"].uses & state
-    ):
+    parameters = {p.name for p in system.parameters if system.run.by_parameters}
+    used = functions["signal"].uses if "signal" in functions else frozenset()
+    if not system.run.needs_derivatives or not used & (state | parameters):
         return
     try:
         derived = outputs.signal_slopes(system)
@@ -266,8 +270,12 @@ def _signal_slopes(system: System, functions: Mapping[str, Function]) -> Iterato
             "have no derivatives: make it smooth, say tanh(x/width), or do without discretize"
         )
         raise SceneError([system.problem("run.discretize", message)]) from None
-    rows = [x for row in derived.slopes for x in row[: len(state)]]
-    yield lower("signal_slopes", derived.tape, rows, system.names)
+    if used & state:
+        rows = [x for row in derived.slopes for x in row[: len(state)]]
+        yield lower("signal_slopes", derived.tape, rows, system.names)
+    if used & parameters:
+        rows = [x for row in derived.sensitivity for x in row]
+        yield lower("signal_sensitivity", derived.tape, rows, system.names)
 
 
 def _applied(system: System) -> Iterator[Function]:

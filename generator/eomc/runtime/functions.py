@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from math import copysign, inf
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 from numpy import empty
@@ -53,6 +53,7 @@ FUNCTIONS: Mapping[str, StateFunction] = {
     "power": StateFunction(lambda _: ()),
     "signal": StateFunction(lambda m: (m.nu,)),
     "signal_slopes": StateFunction(lambda m: (m.nu, 2 * m.nq)),
+    "signal_sensitivity": StateFunction(lambda m: (m.nu, len(m.parameters))),
     "applied": StateFunction(lambda m: (m.nu,)),
     "outputs": StateFunction(lambda m: (len(m.outputs),)),
     "output_slopes": StateFunction(lambda m: (len(m.outputs), 3 * m.nq + m.nu)),
@@ -647,10 +648,7 @@ class Functions(Component):
             If the module was built without these derivatives, or has no outputs.
         """
         if not hasattr(self.c.lib, "sensitivity"):
-            raise ValueError(
-                f"sensitivity: {self.info.name} was built without it: build it, with "
-                "parameters, with " + option("linearize", '"parameters"')
-            )
+            self.refuse_sensitivity("sensitivity")
         E: Array = self.evaluate("sensitivity", q, qd, t, u, params)
         check_finite(E, 2, q, qd, "a derivative")
         if not as_flag(outputs, "outputs"):
@@ -770,6 +768,16 @@ class Functions(Component):
             what = "" if status == "singular" else "a derivative is not finite there"
             refuse(status, at, moving, completed, what)
         return result
+
+    def refuse_sensitivity(self, name: str) -> NoReturn:
+        """Raise ValueError: the module has no derivatives with respect to parameters.
+
+        name: the function that needs them.
+        """
+        raise ValueError(
+            f"{name}: {self.info.name} was built without derivatives with respect to parameters: "
+            "build it, with parameters, with " + option("linearize", '"parameters"')
+        )
 
     def rhs(self, t: float, x: ArrayLike, u: Any = None, params: Parameters = None) -> Array:
         """Return dx/dt = [qd; qdd] for x = [q; qd], as `scipy.integrate.solve_ivp` calls it.

@@ -164,13 +164,13 @@ class Integrator(Component):
     def discretize(
         self, q: ArrayLike, qd: ArrayLike, h: float | None = None, t: float = 0.0, u: Any = None,
         params: Any = None, method: str | None = None, *, control_period: float | None = None,
-        out: tuple[Array, Array] | None = None,
-    ) -> tuple[Array, Array]:  # fmt: skip
-        """Return the derivatives Phi and Gamma of one step: dx' = Phi dx + Gamma du.
+        parameters: bool = False, out: tuple[Array, Array] | None = None,
+    ) -> tuple[Array, ...]:  # fmt: skip
+        """Return the derivatives Phi, Gamma and E of one step: dx' = Phi dx + Gamma du + E dp.
 
-        x = [q; qd] is the state before the step, x' the state after it, and u are the inputs. The
-        derivatives are those of the step itself, not of the exact motion, and are exact to
-        rounding.
+        x = [q; qd] is the state before the step, x' the state after it, u are the inputs, and p
+        the parameters. The derivatives are those of the step itself, not of the exact motion, and
+        are exact to rounding.
 
         Parameters
         ----------
@@ -190,15 +190,21 @@ class Integrator(Component):
         control_period : float, optional
             Period, s, of several steps that are differentiated together. The inputs are constant
             over it: `u`, or the scene's signals at its start.
+        parameters : bool
+            Return E, too. The initial state x is constant, even if the scene's initial values are
+            formulas of parameters.
         out : (Phi, Gamma), optional
-            Arrays that receive the results. Their contents are undefined after an error.
+            Arrays that receive Phi and Gamma. Their contents are undefined after an error.
 
         Returns
         -------
         Phi : (2 nq, 2 nq) array
-            dx'/dx. For n states both results have a leading axis n.
+            dx'/dx. For n states all results have a leading axis n.
         Gamma : (2 nq, nu) array
             dx'/du.
+        E : (2 nq, np) array, if `parameters`
+            dx'/dp, a column for each parameter, at constant inputs `u`; if the step follows the
+            scene's signals, through these too.
 
         Raises
         ------
@@ -217,23 +223,31 @@ class Integrator(Component):
                 f"discretize: {self.info.name} was built without it: build it with "
                 f"{option('discretize')}"
             )
+        functions = self.model.functions
+        count = len(self.info.parameters) if hasattr(lib, "sensitivity") else 0
+        if as_flag(parameters, "parameters") and not count:
+            functions.refuse_sensitivity("discretize")
         rows, n, nu = q.shape[:-1], self.info.nq, self.info.nu
         Phi, Gamma = self.arguments.output_matrices(out, "(Phi, Gamma)", q, qd)
-        K = None
+        E = empty((*rows, 2 * n, count), self.info.dtype)
+        K = u_p = None
         if hold is not None and u is None and self.info.nu:
-            u = self.model.functions.signal(q, qd, t, params)
+            u = functions.signal(q, qd, t, params)
             if hasattr(lib, "signal_slopes"):
-                K = self.model.functions.feedback(q, qd, None, t, params)
+                K = functions.feedback(q, qd, None, t, params)
+            if hasattr(lib, "signal_sensitivity"):
+                u_p = functions.evaluate("signal_sensitivity", q, qd, t, None, params)
         steps, acts = hold or 1, StateArguments(self.arguments, rows, t, u, params)
         derivative, null = getattr(lib, f"{method}_derivative"), self.c.null
-        to_Phi, to_Gamma, from_q, from_qd = (
-            self.c.pointer(x) if x.size else null for x in (Phi, Gamma, q, qd)
+        to_Phi, to_Gamma, to_E, from_q, from_qd = (
+            self.c.pointer(x) if x.size else null for x in (Phi, Gamma, E, q, qd)
         )
         for k, many in slices(q.size // n, _STEPS // (steps * n**3) + 1):
             now, inputs, p, own = acts.pointers(k)
             code = derivative(
                 many, to_Phi + 4 * n**2 * k, to_Gamma + 2 * n * nu * k if nu else null,
-                from_q + n * k, from_qd + n * k, now, h, steps, inputs, p, own,
+                to_E + 2 * n * count * k if count else null, from_q + n * k, from_qd + n * k, now,
+                h, steps, inputs, p, own,
             )  # fmt: skip
             if code & 7:
                 completed, step = divmod(code >> 3, steps)
@@ -241,7 +255,9 @@ class Integrator(Component):
                         acts.time(k + completed), step, STATUS[code & 7])  # fmt: skip
         if K is not None:
             Phi += Gamma @ K
-        return Phi, Gamma
+        if u_p is not None:
+            E += Gamma @ u_p
+        return (Phi, Gamma, E) if parameters else (Phi, Gamma)
 
     def simulate(
         self, q0: Start = None, qd0: Start = None, h: float | None = None,

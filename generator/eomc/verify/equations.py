@@ -338,13 +338,23 @@ def step_derivative_checks(comparison: Comparison) -> Iterator[Check]:
         )  # fmt: skip
 
 
+def _has_parameters(of: Comparison) -> bool:
+    """Return True if steps have derivatives with respect to parameters."""
+    return of.system.run.by_parameters and bool(of.system.parameters)
+
+
+def _parameter_values(of: Comparison, s: State) -> dict[str, float]:
+    """Return the parameters at a state by name; {} if steps have no derivatives by them."""
+    return dict(s.params or of.sampler.defaults) if _has_parameters(of) else {}
+
+
 def _variable_scales(of: Comparison, s: State) -> Vector:
-    """Return typical sizes of q, q̇ and u, (2 nq + nu,)."""
-    n, nu = len(s.q), len(of.system.inputs)
-    scales = np.concatenate([of.sampler.spread, of.sampler.speed, np.ones(nu)])
-    if s.u is not None:
-        scales[2 * n :] = np.maximum(1.0, np.abs(s.u))
-    return scales
+    """Return typical sizes of q, q̇, u and p, (2 nq + nu + np,)."""
+    values = np.abs([*_parameter_values(of, s).values()])
+    u = np.ones(len(of.system.inputs)) if s.u is None else np.maximum(1.0, np.abs(s.u))
+    return np.concatenate(
+        [of.sampler.spread, of.sampler.speed, u, np.where(values > 0, values, 1.0)]
+    )
 
 
 def _step_error(
@@ -361,9 +371,12 @@ def _step_error(
         if not any(np.isfinite(J).all() for J in near) or _moves_far(of, method, s, h):
             continue
         arguments = {"h": h, "t": s.t, "u": s.u, "params": s.params, "method": method}
+        if _has_parameters(of):
+            arguments["parameters"] = True
         derivatives = [np.asarray(x, float) for x in of.module.discretize(s.q, s.qd, **arguments)]
         # inputs may change a coordinate by 1e-4 of its scale in a step; less is not judged
-        parts, size = (slice(0, 2 * n), slice(2 * n, None)), 1e-4 * scales[: 2 * n]
+        ends, size = np.cumsum([x.shape[1] for x in derivatives]), 1e-4 * scales[: 2 * n]
+        parts = [slice(end - x.shape[1], end) for end, x in zip(ends, derivatives, strict=True)]
         off = [
             np.hstack(
                 [
@@ -385,26 +398,32 @@ def _moves_far(of: Comparison, method: str, s: State, h: float) -> bool:
 
 
 def _step_differences(of: Comparison, method: str, s: State, h: float, by: Vector) -> Vector:
-    """Return derivatives of a step's end with respect to q, q̇ and u, (2 nq, 2 nq + nu).
+    """Return derivatives of a step's end by q, q̇, u and p, (2 nq, 2 nq + nu + np).
 
     They are differences of the reference's steps. Changes of u are added to the signals if the
     state has no inputs.
     """
     n, nu, reference = len(s.q), len(of.system.inputs), of.reference
+    values = _parameter_values(of, s)
 
     def ends(rows: Vector) -> Vector:
+        params: Any = s.params
+        if values:
+            params = dict(zip(values, rows[:, 2 * n + nu :].T, strict=True))
+
         def acceleration(q: Vector, qd: Vector, t: float) -> Vector:
             u, now = None, np.full(len(q), t)
             if nu:
-                own = reference.evaluate("signals", q, qd, now, None, s.params)
-                u = rows[:, 2 * n :] + (own if s.u is None else s.u)
-            return reference.acceleration(q, qd, now, u, s.params)
+                own = reference.evaluate("signals", q, qd, now, None, params)
+                u = rows[:, 2 * n : 2 * n + nu] + (own if s.u is None else s.u)
+            return reference.acceleration(q, qd, now, u, params)
 
         q, qd = runge_kutta_step(
             METHODS[method], acceleration, rows[:, :n], rows[:, n : 2 * n], s.t, h
         )
         if of.system.constraints:
-            q, qd = reference.corrected(q, qd, s.t + h, s.params)
+            q, qd = reference.corrected(q, qd, s.t + h, params)
         return np.hstack([q, qd])
 
-    return differences(ends, np.concatenate([s.q, s.qd, np.zeros(nu)]), by)
+    x = np.concatenate([s.q, s.qd, np.zeros(nu), list(values.values())])
+    return differences(ends, x, by)

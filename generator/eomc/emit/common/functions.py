@@ -469,7 +469,8 @@ class SceneFunctions:
         """The static C function that computes corrections of q and qd and their derivatives.
 
         The corrections move q and qd onto the constraints. The derivatives are along a direction in
-        q, qd and u. None if the scene has no constraints or does not request derivatives of steps.
+        q, qd, u and p. None if the scene has no constraints or does not request derivatives of
+        steps.
         """
         doc = CORRECTION_DERIVATIVES
         return self._static_if_needed("projection_along", "column", doc, fails=True)

@@ -129,6 +129,8 @@ KINDS: Mapping[str, Kind] = {
         "Inputs that act: u, or the signals, saturated at their limits."),
     "signal_slopes": Kind("slopes", "m*x", "qd",
         "Derivatives [du/dq, du/dqd] of the scene's signals u, by rows."),
+    "signal_sensitivity": Kind("slopes", "m*p", "qd",
+        "Derivatives du/dp of the scene's signals u, by rows, columns for parameters."),
     "signal": Kind("u", "m", "qd", "Signals of the scene for the inputs u."),
 }  # fmt: skip
 _PLANE = {
@@ -170,6 +172,7 @@ def c_array_size(target: Target, shape: str) -> str:
         "x": " + ".join((f"2*{NQ}", *([NU] if s.inputs else []), *([str(np)] if np else []))),
         "m": NU,
         "m*x": f"{NU}*2*{NQ}",
+        "m*p": f"{NU}*{len(s.parameters)}",
         "y": NY,
         "y*x": f"{NY}*(3*{NQ} + {NU})" if s.inputs else f"{NY}*(3*{NQ})",
         "y*p": f"{NY}*{np}",
@@ -343,16 +346,31 @@ class Public:
         """
         return self._status(f"{method}_step", *self._state, *self.arguments("t", "h", "u", "p"))
 
+    @property
+    def step_columns(self) -> dict[str, str]:
+        """The numbers of columns of the derivatives of a step, as C expressions by name.
+
+        They are Phi, with inputs Gamma, and E if the scene requests derivatives with respect to its
+        parameters.
+        """
+        target, columns = self.target, {"Phi": f"2*{self.target.PREFIX}_NQ"}
+        if target.system.inputs:
+            columns["Gamma"] = f"{target.PREFIX}_NU"
+        if self.has("sensitivity"):
+            columns["E"] = str(len(target.parameters))
+        return columns
+
     def derivative(self, method: str) -> CFunction:
         """Return the prototype of the C function that differentiates one step of a method.
 
         It computes the partial derivatives of the state [q, qd] after the step: Phi with respect to
-        [q, qd] before the step, and Gamma with respect to u. The function returns a status code.
+        [q, qd] before the step, Gamma with respect to u, and E with respect to the parameters. The
+        function returns a status code.
         """
-        target, NQ = self.target, f"{self.target.PREFIX}_NQ"
-        out = [output_array(target.real.name, "Phi", f"4*{NQ}*{NQ}")]
-        if target.system.inputs:
-            out.append(output_array(target.real.name, "Gamma", f"2*{NQ}*{target.PREFIX}_NU"))
+        real, NQ = self.target.real.name, f"{self.target.PREFIX}_NQ"
+        sizes = {name: f"2*{NQ}*{count}" for name, count in self.step_columns.items()}
+        sizes["Phi"] = f"4*{NQ}*{NQ}"
+        out = (output_array(real, name, size) for name, size in sizes.items())
         return self._status(
             f"{method}_derivative", *out, *self.arguments(*STATE, "t", "h", "u", "p")
         )

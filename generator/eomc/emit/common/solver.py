@@ -130,6 +130,20 @@ EVALUATIONS = (
     ("evaluate_residuals", "constraints", "Residuals of the constraints.", "residual", 2),
     ("evaluate_rates", "constraint_rates", "Rates of the constraints.", "residual", 2),
     ("evaluate_signal_derivatives", "signal_slopes", "K = the derivatives of the inputs.", "K", 2),
+    (
+        "evaluate_signal_sensitivity",
+        "signal_sensitivity",
+        "The derivatives of the inputs with respect to the parameters.",
+        "u_p",
+        2,
+    ),
+    (
+        "evaluate_parameter_derivatives",
+        "sensitivity",
+        "E = the derivatives of the accelerations with respect to the parameters.",
+        "E",
+        2,
+    ),
 )
 
 
@@ -443,8 +457,9 @@ def tableau_tables(functions: SceneFunctions, method: Method) -> tuple[str, ...]
 def step_derivatives(model: SolverModel) -> Iterator[str]:
     """Yield C definitions of the derivatives of a step of each integration method.
 
-    The derivatives are with respect to q, qd and u. Nothing is yielded if the scene does not
-    request them. Methods share definitions.
+    The derivatives are with respect to q, qd, u and, if the scene requests them, the parameters.
+    Nothing is yielded if the scene does not request derivatives of steps. Methods share
+    definitions.
     """
     functions, target = model.functions, model.functions.target
     if not target.system.run.discretize:
@@ -454,9 +469,11 @@ def step_derivatives(model: SolverModel) -> Iterator[str]:
         "INPUTS": inputs,
         "FEEDBACK": "signal_slopes" in target.program,
         "CONSTRAINTS": functions.projection_along is not None,
+        "PARAMETERS": "sensitivity" in target.program,
+        "SIGNAL_PARAMETERS": "signal_sensitivity" in target.program,
     }
-    width = f"2*{functions.NQ}" + (f" + {functions.NU}" if inputs else "")
-    exact = {"EOM_VARIABLES": width}
+    width = " + ".join(functions.public.step_columns.values())
+    exact = {"EOM_VARIABLES": width, "EOM_NP": str(len(target.parameters))}
     if model.has_sweep:  # whose accelerations take precomputed constants
         exact["eom_accelerate"] = f"{functions.prefix}_evaluate_accelerations"
     for method in functions.methods:
@@ -464,7 +481,7 @@ def step_derivatives(model: SolverModel) -> Iterator[str]:
         tables = (f"eom_{method_kind(method)}_{name}" for name in ("c", "A", "AA", "b", "bA"))
         yield from amalgamate(
             ("step_end.c", "step_derivative.c"),
-            [f"eom_method_differentiate_{kind}_step", "eom_store_derivatives", *tables],
+            [f"eom_method_differentiate_{kind}_step", "eom_copy_columns", *tables],
             library_names(model, method, **exact),
             features,
             tableau_tables(functions, method),
@@ -475,7 +492,7 @@ def step_derivatives(model: SolverModel) -> Iterator[str]:
 def _derivative(model: SolverModel, method: Method, width: str) -> str:
     """Return the definition of the public function for the derivatives of a step of a method.
 
-    width: number of variables in q, qd and u, as a C expression.
+    width: number of variables, as a C expression.
     """
     functions, prefix = model.functions, f"{model.functions.prefix}_{method.name}"
     function = functions.public.derivative(method.name)
@@ -490,8 +507,14 @@ def _derivative(model: SolverModel, method: Method, width: str) -> str:
         f"{method.name}_differentiate_{'implicit' if method.implicit else 'explicit'}_step",
         "ends", *end, "q", "qd", time, "h",
     )  # fmt: skip
-    out = [a.name for a in function.arguments if a.name in ("Phi", "Gamma")]
-    store = f"{functions.prefix}_store_derivatives({', '.join([*out, 'ends'])})"
+    store, first = [], "0"
+    for name, count in functions.public.step_columns.items():
+        passed = ", ".join((name, "ends", first, count))
+        store.append(c.call_statement(f"{functions.prefix}_copy_columns({passed})"))
+        first = count if first == "0" else f"{first} + {count}"
+    unfinite = c.return_if(
+        [f"!{functions.prefix}_finite(ends, 2*{NQ}*({width}))"], f"{functions.PREFIX}_NOT_FINITE"
+    )
     unused = {a.name: "0" for a in model.members if a.name == "c"}
     variables = (
         *model.variable(**unused).lines,
@@ -501,7 +524,8 @@ def _derivative(model: SolverModel, method: Method, width: str) -> str:
     )
     statements = (
         *(make_step if compares else ()), c.assign("status", call),
-        c.return_statement(f"status ? status : {store}"),
+        *c.return_if(["status"], "status"), *unfinite, *store,
+        c.return_statement(f"{functions.PREFIX}_OK"),
     )  # fmt: skip
     return define(function, Block("", variables), Block("", statements))
 
