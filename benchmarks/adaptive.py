@@ -1,10 +1,11 @@
-"""Adaptive steps against heyoka's Taylor integrator and our fixed steps; writes ADAPTIVE.md.
+"""Compare adaptive steps with heyoka's Taylor integrator and with fixed steps; write ADAPTIVE.md.
 
     python benchmarks/adaptive.py [--rounds 40] [--only WORD]
 
-Cases of tests/data/cases.json without constraints, to errors of 1e-9 and 1e-12 at the end. Each
-takes its loosest tolerance, in steps of sqrt 10, or longest step that reaches it; of several forms
-that do, the quickest. Then all run in turns on one pinned core; of each the least time counts.
+Cases of tests/data/cases.json without constraints, with errors of at most 1e-9 and 1e-12 at the
+end. Each program uses its loosest tolerance, in steps of sqrt 10, or longest step that reaches the
+error, in its fastest form. Then all run in turns on one pinned core; the smallest time of each
+counts.
 """
 
 from __future__ import annotations
@@ -188,7 +189,7 @@ def lines(name: str, rounds: int, most: float) -> Iterator[Line | str]:
                 if k is None
             }
             if floors.get("ours", 0.0) > NONE:
-                yield f"{name} (no double-precision method has an answer)"
+                yield f"{name} (not solvable in double precision)"
                 return
             answered = {who: floor for who, floor in floors.items() if floor <= NONE}
             if answered:
@@ -230,10 +231,9 @@ def line(case: Case, wanted: float, said: str, k: int, other: int | None, rounds
 HEAD = """\
 # Adaptive steps
 
-Written by `python benchmarks/adaptive.py`: the cases of `tests/data/cases.json` without constraints, to
-errors of {targets} at the end: max |q - q_ref| / max(1, max |q_ref|). Whole runs in us, the
-least of {rounds} rounds in which all run in turns on one core; *ratio* is `module.simulate(tol=...)`
-over heyoka's `taylor_adaptive`.
+Written by `python benchmarks/adaptive.py`: the cases of `tests/data/cases.json` without constraints, with errors of at most {targets} at the end:
+max |q - q_ref| / max(1, max |q_ref|). Times of whole runs in us, the smallest of {rounds} rounds in which all programs run in turns on one core.
+*Ratio*: time of `module.simulate(tol=...)` divided by that of heyoka's `taylor_adaptive`.
 
 {machine}
 
@@ -241,30 +241,28 @@ over heyoka's `taylor_adaptive`.
 |---|---|---|---|---|---|---|---|---|---|---|---|---|---|
 """  # noqa: E501
 TAIL = """
-- *Target*: where rounding keeps one of the two from it, twice the least error that this one reaches
-  at any tolerance, so that both can ("floor"; it is left out where it says the same twice).
-- Ours: the loosest tolerance, in steps of sqrt 10, that reaches the target. *In C*: the same loop,
-  no rows kept, called with nothing around it.
-- Fixed: the quickest of {methods}, each at its longest step that reaches the target, within 5 %.
-- heyoka: its loosest tolerance, in the same steps; accelerations from the same K and P by SymPy,
-  parameters folded in, expanded or simplified, solved by Cramer's rule or LDL^T, or by its own
-  `lagrangian`; with and without `fast_math`, above four coordinates also in compact mode: the
-  quickest of all. Compilation is not counted.
+- *Target*: if rounding errors prevent one of the two from reaching the target, it is twice the smallest error that this one reaches at any
+  tolerance ("floor"); a second row with the same target is left out.
+- Ours: the loosest tolerance, in steps of sqrt 10, that reaches the target. *In C*: the same loop without rows, called directly.
+- Fixed: the fastest of {methods}, each with the longest step that reaches the target, within 5 %.
+- heyoka: the loosest tolerance, in the same steps. Accelerations are derived from the same K and P by SymPy, with parameters as constants, expanded or
+  simplified, solved by Cramer's rule or LDL^T, or by its own `lagrangian`; with and without `fast_math`, above four coordinates also in compact mode.
+  The fastest of these counts. Compilation is not counted.
 - Left out: {left}.
-"""
+"""  # noqa: E501
 
 
 def findings(found: list[Line]) -> str:
-    """How many meet the bars, and which are lost."""
+    """Return the summary: how many cases meet the bars, and which do not."""
     rated = [line.ratio for line in found if line.theirs is not None]
     lost = [f"{x.name} to {x.wanted:.0e} ({x.ratio:.2f})" for x in found if not x.met]
     alone = [x.name for x in found if x.theirs is None]
     middle = float(np.median(rated)) if rated else math.nan
     return (
-        f"\nAt most {EACH:g} of heyoka's time on each: {len(found) - len(lost)} of {len(found)}. "
+        f"\nRatio at most {EACH:g}: {len(found) - len(lost)} of {len(found)}. "
         f"Median {middle:.2f}, bar {MEDIAN:g} {'met' if middle <= MEDIAN else '**missed**'}.\n\n"
-        f"Lost: {', '.join(lost) or 'none'}.\n"
-        + (f"\nheyoka has no answer: {', '.join(alone)}.\n" if alone else "")
+        f"Ratio above {EACH:g} (**lost**): {', '.join(lost) or 'none'}.\n"
+        + (f"\nheyoka does not reach the target: {', '.join(alone)}.\n" if alone else "")
     )
 
 
@@ -277,7 +275,7 @@ def main() -> None:
     os.sched_setaffinity(0, {min(CORES)})
     warnings.simplefilter("ignore", RuntimeWarning)  # of steps that are too long
     found: list[Line] = []
-    left = [f"{name} (its right-hand side jumps)" for name in JUMPS]
+    left = [f"{name} (discontinuous right-hand side)" for name in JUMPS]
     for name, case in cases().items():
         if case["constraints"] or name in JUMPS or options.only not in name:
             continue

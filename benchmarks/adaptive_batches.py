@@ -1,10 +1,10 @@
-"""Adaptive steps of many against heyoka's batch integrator; writes ADAPTIVE_BATCHES.md.
+"""Compare adaptive steps of batches with heyoka's batch integrator; write ADAPTIVE_BATCHES.md.
 
     python benchmarks/adaptive_batches.py [--rounds 15]
 
-4,096 starts each, one thread, to an error of 1e-9 at the end: each takes its loosest tolerance, in
-steps of sqrt 10, that reaches it for all of them. Then all run in turns on one pinned core; of each
-the least time counts, from Python and back.
+4,096 initial states each, one thread, with errors of at most 1e-9 at the end: each program uses its
+loosest tolerance, in steps of sqrt 10, that reaches this for all instances. Then all run in turns
+on one pinned core; the smallest time of each counts, called from Python.
 """
 
 from __future__ import annotations
@@ -117,18 +117,17 @@ def ways(name: str) -> tuple[Way, list[Way]]:
 
 
 HEAD = """\
-# Adaptive steps of many
+# Adaptive steps of batches
 
-Written by `python benchmarks/adaptive_batches.py`: {many:,} starts each, one thread, to an error of
-{wanted:g} of every one at the end. us an instance, the least of {rounds} rounds in which all run in
-turns on one core; heyoka in batches of {width}, the quickest of its forms
-(benchmarks/taylor.py), its compilation not counted.
+Written by `python benchmarks/adaptive_batches.py`: {many:,} initial states each, one thread, with an error of at most {wanted:g} of each instance at the end.
+Times in us per instance, the smallest of {rounds} rounds in which all programs run in turns on one core. heyoka integrates batches of {width}, in the fastest
+of its forms (benchmarks/taylor.py); its compilation is not counted.
 
 {machine}
 
-| | tol | error | us | heyoka | tol | error | us | ratio, bar {bar:g} |
+| system | tol | error | us | heyoka | tol | error | us | ratio, bar {bar:g} |
 |---|---|---|---|---|---|---|---|---|
-"""
+"""  # noqa: E501
 
 
 def main() -> None:

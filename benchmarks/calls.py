@@ -1,14 +1,13 @@
-"""What a call and an import of a built module cost beside the loop in C.
+"""Measure the overhead of a call and of the import of a built module.
 
     python benchmarks/calls.py [--rounds 25]
 
-- a call of `simulate` or `simulate_batch`, and the loop in C that it makes: the C function with the
-  same arguments and rows. Both are processor times of the thread, so that others on the same core
-  do not count, and the least of the rounds, which alternate. On a machine shared with others they
-  come in two sizes, up to 1.8 apart: where somebody else has the other half of the physical core,
-  an interpreter gets half of the instructions through;
-- `step_batch` of eight instances, whole: learning loops pay it in every step;
-- import: of a built scene in a fresh process, bytecode in place, after NumPy is there.
+- A call of `simulate` or `simulate_batch`, compared with the C function with the same arguments and
+  rows. Both are processor times of the thread, so that other processes on the core do not count, and
+  the smallest of the rounds, which alternate. On a shared machine the times may differ by a factor of
+  up to 1.8, depending on whether the other hardware thread of the core is in use.
+- `step_batch` of eight instances, including all checks, as in a learning loop.
+- The import of a built scene in a new process, with bytecode in place, after NumPy.
 """
 
 from __future__ import annotations
@@ -189,21 +188,30 @@ def import_time(root: Path, rounds: int) -> float:
     return min(float(run.stdout) for run in done)
 
 
+def table(root: Path, rounds: int) -> str:
+    """Measure all calls and the import, and return the tables of the page."""
+    lines = ["| call | whole, us | loop in C, us | overhead, us | bar |", "|---|---|---|---|---|"]
+    for title, (whole, bare) in overheads(root, rounds).items():
+        verdict = "met" if whole - bare <= OVERHEAD_BAR else "**missed**"
+        numbers = " | ".join(f"{1e6 * x:.2f}" for x in (whole, bare, whole - bare))
+        lines.append(f"| {title} | {numbers} | {1e6 * OVERHEAD_BAR:g} us {verdict} |")
+    lines.append(f"| `step_batch` of eight | {1e6 * batch_step(root, rounds):.2f} | | | |")
+    spent = import_time(root, min(rounds, 9))
+    verdict = "met" if spent <= IMPORT_BAR else "**missed**"
+    lines += [
+        "",
+        f"Warm import of a built module beyond NumPy's: {1e3 * spent:.3g} ms, "
+        f"bar {1e3 * IMPORT_BAR:g} ms {verdict}.",
+    ]
+    return "\n".join(lines) + "\n"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rounds", type=int, default=25)
     rounds = parser.parse_args().rounds
     with tempfile.TemporaryDirectory() as folder:
-        root = Path(folder)
-        print("| call | whole, us | loop in C, us | overhead, us | bar |\n|---|---|---|---|---|")
-        for title, (whole, bare) in overheads(root, rounds).items():
-            verdict = "met" if whole - bare <= OVERHEAD_BAR else "**missed**"
-            numbers = " | ".join(f"{1e6 * x:.2f}" for x in (whole, bare, whole - bare))
-            print(f"| {title} | {numbers} | {1e6 * OVERHEAD_BAR:g} us {verdict} |")
-        print(f"| `step_batch` of eight | {1e6 * batch_step(root, rounds):.2f} | | | |")
-        spent = import_time(root, min(rounds, 9))
-        verdict = "met" if spent <= IMPORT_BAR else "**missed**"
-        print(f"\nwarm import beyond NumPy's: {1e3 * spent:.3g} ms, {1e3 * IMPORT_BAR:g} {verdict}")
+        print(table(Path(folder), rounds))
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
-"""Closed loops at matched errors, beside MuJoCo, Pinocchio and Exudyn; writes CONSTRAINED.md.
+"""Compare closed loops at matched errors with MuJoCo, Pinocchio and Exudyn; write CONSTRAINED.md.
 
     python benchmarks/constrained.py [--rounds 40] [--only WORD]
 
-Cases of tests/data/constrained.json, whose ends are known to 27 digits and more. Each method takes
-its fewest steps or loosest tolerance that reaches the error; then all run in turns on one pinned
-core, of each the least time counts. The peers have the four-bar.
+Cases of tests/data/constrained.json, whose final positions are known to 27 digits and more. Each
+method makes the fewest steps or has the loosest tolerance that reaches the error; then all run in
+turns on one pinned core, and the smallest time of each counts. The other programs run the four-bar.
 """
 
 from __future__ import annotations
@@ -257,24 +257,28 @@ def bar(what: str, measured: float, most: float, unit: str = "", said: str = "")
 
 
 def named(step: dict[str, float], word: str) -> float:
-    """The least of those whose name begins so."""
+    """Return the smallest value whose name begins with `word`."""
     return min(value for name, value in step.items() if name.startswith(word))
 
 
 def of_steps(same: Alike) -> list[str]:
-    """The four-bar's, all steps alike."""
+    """Return the rows of the four-bar linkage with equal steps."""
     us, rk4 = same.step["eomc, RK4"], "MuJoCo, RK4"
     better = same.error[rk4] / same.error["eomc, RK4"]
     return [
-        bar("four-bar, RK4 step with correction", us, 0.35, " us"),
-        bar("the same over MuJoCo's RK4 step", us / same.step[rk4], 1 / 60),
-        bar("our error over MuJoCo's there", 1 / better, 1 / 40),
-        bar("the same over four calls of Pinocchio", us / named(same.step, "Pinocchio"), 1 / 15),
+        bar("four-bar, RK4 step with projection", us, 0.35, " us"),
+        bar("the same, divided by MuJoCo's RK4 step", us / same.step[rk4], 1 / 60),
+        bar("our error, divided by MuJoCo's", 1 / better, 1 / 40),
+        bar(
+            "the step, divided by four calls of Pinocchio",
+            us / named(same.step, "Pinocchio"),
+            1 / 15,
+        ),
     ]
 
 
 def of_runs(made: dict[str, Case], rounds: int) -> list[str]:
-    """Whole runs in C: the steps that the bar names, and the quickest that does."""
+    """Return the rows of whole runs in C: with the given number of steps, and the fastest run."""
     made_of = (
         ("Andrews' squeezer, 0.03 s", ANDREWS, 300, 1e-7, 0.5),
         ("A02, N = 2, 10 s", A02, 500, 1e-3, 1.0),
@@ -292,20 +296,20 @@ def of_runs(made: dict[str, Case], rounds: int) -> list[str]:
         )
         rows.append(
             bar(
-                f"{what}, quickest to {wanted:.0e}: {way}", float(times[1 + best]), most, " ms",
-                f", error {way.error:.1e}",
+                f"{what}, fastest with an error of at most {wanted:.0e}: {way}",
+                float(times[1 + best]), most, " ms", f", error {way.error:.1e}",
             )
         )  # fmt: skip
     return rows
 
 
 def of_flops() -> list[str]:
-    """What the generator counts, sines apart."""
+    """Return the rows of operations that the generator counts, without sines."""
     largest = next(reversed(FLOPS))
     begun = time.process_time()
     pipeline.sources(system(largest))
     spent = time.process_time() - begun
-    rows = [bar(f"derive and generate, {largest}, of processor time", spent, 15, " s")]
+    rows = [bar(f"processor time to derive and generate {largest}", spent, 15, " s")]
     for name, most in FLOPS.items():
         made = program.build(lagrange.derive(system(name)))
         flops = made["acceleration"].cost.flops
@@ -313,7 +317,7 @@ def of_flops() -> list[str]:
         if name in SHARES:
             one = made["projection"].cost.flops
             share = one / (4 * flops + one)
-            what = f"the correction's share of an RK4 step's flops, {name}"
+            what = f"share of the projection in the flops of an RK4 step, {name}"
             rows.append(bar(what, share, SHARES[name], "", f" ({one} of {4 * flops + one})"))
     return rows
 
@@ -323,60 +327,54 @@ def of_flops() -> list[str]:
 HEAD = """\
 # Constraints and closed loops
 
-Written by `python benchmarks/constrained.py`: cases of `tests/data/constrained.json`, whose ends
-are known to 27 digits and more. *Error*: max |q - q_ref| / max(1, max |q_ref|) at the end. Times in
-us, the least of up to {rounds} rounds in which all of a group run in turns on one core.
+Written by `python benchmarks/constrained.py`: cases of `tests/data/constrained.json`, whose final positions are known to 27 digits and more. *Error*:
+max |q - q_ref| / max(1, max |q_ref|) at the end. Times in us, the smallest of up to {rounds} rounds in which all programs of a group run in turns on one core.
 
 {machine}
-"""
+"""  # noqa: E501
 OWN = """
 ## At matched errors
 
-Whole runs in C, positions and rates corrected after each step. Each method takes its fewest steps,
-within 5 %, or loosest tolerance, in steps of sqrt 10, that reaches the error; the quickest is
-named, with the time of a run and of a step. On the right a run by each (–: none found that takes
-less than {worth:g} ms); *not reached*: with the least error seen. The windows of A02 lie flat again
-and again, where rows depend on each other: there errors depend on how close to that a step ends.
+Whole runs in C, with positions and velocities projected after each step. Each method makes the fewest steps, within 5 %, or has the loosest tolerance, in
+steps of sqrt 10, that reaches the error. The fastest is named, with its time per run and per step. The last columns are the times of a run by each method
+(–: no run of less than {worth:g} ms reaches the error); *not reached*: the smallest error. The linkages of A02 are repeatedly in singular positions,
+where the error depends on how close to the position a step ends.
 
-| case | wanted | quickest | error | run | step | rk4 | dp8 | gauss16 | adaptive |
+| case | required | fastest | error | run | step | rk4 | dp8 | gauss16 | adaptive |
 |---|---|---|---|---|---|---|---|---|---|
-"""
+"""  # noqa: E501
 PEERS = """
-## The four-bar, beside others
+## Four-bar linkage, comparison with other programs
 
-`four_bar_crank_rocker`, 10 s. *Ratio*: our run over theirs. A peer's run is its step, of the first
-{sample} steps, times their number. *Not reached*: its least error, said once; tried were up to
-this many steps: {most}.
+`four_bar_crank_rocker`, 10 s. *Ratio*: our run divided by theirs. The time of a run of another program is that of a step, measured over the first {sample}
+steps, times their number. *Not reached*: its smallest error, listed once, with up to this many steps: {most}.
 
-| wanted | who, how | error | run | step | ratio |
+| required | program, method | error | run | step | ratio |
 |---|---|---|---|---|---|
-"""
+"""  # noqa: E501
 SAME = """
-### In steps of {h:g} s
+### With steps of {h:g} s
 
-| who, how | error | step |
+| program, method | error | step |
 |---|---|---|
 """
 BARS = """
-## Bars
+## Required values
 
-| figure | measured | bar | |
+| quantity | measured | bar | |
 |---|---|---|---|
 """
 TAIL = """
-- MuJoCo: a tree of three hinges, closed by `connect` of two sites; solref 2 h, solimp 0.9999, as
-  its documentation advises for stiff ones; Newton's solver to 1e-15, contacts off;
-  `mj_step(nstep=...)`. Its error changes sign near 7,000 steps of RK4, is 3e-6 in
-  10,000 and stays below 1e-6 from some 30,000 on.
-- Pinocchio: the same tree, a 3D `RigidConstraintModel`, mu = {mu:g}, at most {iterations} proximal
-  iterations, RK4 in Python with the best of three gains of Baumgarte's method. Its time is that of
-  four calls of `constraintDynamics` a step, from Python; the rest of the loop is not counted.
-- Exudyn: three free bodies in the plane, four hinges; its explicit methods refuse such constraints.
-  The best of generalized alpha with spectral radii of 0.9 and 0.5, and the trapezoidal rule with
-  constraints on velocities; Newton's method to 1e-10, nothing written.
-- Flops: additions, multiplications and divisions of one evaluation; sines, and what parameters
-  alone decide, are apart. The correction has a factor of its own, at the state that it corrects.
-"""
+- MuJoCo: a tree of three hinges, closed by `connect` of two sites; solref 2 h, solimp 0.9999, as its documentation recommends for stiff constraints;
+  Newton's solver to 1e-15, without contacts; `mj_step(nstep=...)`. Its error changes sign near 7,000 steps of RK4, is 3e-6 with 10,000 and below 1e-6
+  from some 30,000 on.
+- Pinocchio: the same tree, a 3D `RigidConstraintModel`, mu = {mu:g}, at most {iterations} proximal iterations, RK4 in Python with the best of three gains of
+  Baumgarte's method. Its time is that of four calls of `constraintDynamics` per step, from Python; the rest of the loop is not counted.
+- Exudyn: three free bodies in the plane, four hinges; its explicit methods do not support such constraints. The best of generalized alpha with spectral radii
+  of 0.9 and 0.5, and the trapezoidal rule with constraints on velocities; Newton's method to 1e-10, without output.
+- Flops: additions, multiplications and divisions of one evaluation, without sines and parameter-only expressions. The projection has its own
+  factorisation, at the state that it corrects.
+"""  # noqa: E501
 
 
 def page(rounds: int) -> str:

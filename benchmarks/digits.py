@@ -1,11 +1,11 @@
-"""What 6, 9 and 12 digits cost: our steppers, heyoka's Taylor integrator, SciPy; writes DIGITS.md.
+"""Measure the cost of 6, 9 and 12 digits with eomc, heyoka and SciPy; write DIGITS.md.
 
     python benchmarks/digits.py [--rounds 15] [--only WORD]
 
-The error of a run is the largest, over all its steps and the components of [q; qd], relative to
-the component's largest value, against a trusted motion. Each takes the longest step or loosest
-tolerance that reaches the wanted error; of several forms that do, the quickest. Then all run in
-turns on one pinned core, and the ratio of our time to theirs is taken within each round.
+The error of a run is the largest, over all its steps and the components of [q; qd], relative to the
+component's largest value, compared with a reference solution. Each program uses the longest step or
+loosest tolerance that reaches the required error, in its fastest form. Then all run in turns on one
+pinned core, and the ratio of our time to theirs is computed within each round.
 """
 
 from __future__ import annotations
@@ -428,39 +428,37 @@ def batch(name: str, root: Path, rounds: int) -> Iterator[Line]:
 # --- the page ------------------------------------------------------------------------------------
 
 HEAD = """\
-# What digits cost
+# Cost of correct digits
 
-Written by `python benchmarks/digits.py`. Whole runs over {end:g} s, from Python and back, in us (of
-a batch, us an instance); medians of {rounds} rounds in which all run in turns on one core. *Ratio*
-is ours/theirs, the median and quartiles of the ratios within the rounds: below 1 we are faster.
-*Error*: the largest, over all steps and components of [q; qd], relative to a component's largest
-value; of a batch, at the end, in its first {sample} instances.
+Written by `python benchmarks/digits.py`. Times of whole runs over {end:g} s, called from Python, in us (of a batch, us per instance), medians of {rounds} rounds
+in which all programs run in turns on one core.
+
+- *Ratio*: ours/theirs, with median and quartiles of the ratios within the rounds. Below 1, eomc is faster.
+- *Bar*: the required ratio.
+- *Error*: the largest over all steps and components of [q; qd], relative to the largest value of the component; of a batch, at the end, in its first
+  {sample} instances.
 
 {machine}
 
-| work | digits | ours | error | us | against | setting | error | us | ratio | quartiles | bar |
+| task | digits | ours | error | us | compared with | setting | error | us | ratio | quartiles | bar |
 |---|---|---|---|---|---|---|---|---|---|---|---|
-"""
+"""  # noqa: E501
 TAIL = """
-- The trusted motion is heyoka's in long double at a tolerance of 1e-19, by its dense output; at 17
-  times it agrees to 1e-14 or better with `eomc.report.reference_solution`, in `__float128` by
-  Gauss's method of order 40.
-- Ours: the quickest of {methods}, each at its longest step that reaches the error, to 2 %;
-  `simulate` and `simulate_batch` with all checks.
-- heyoka: the adaptive Taylor integrator, parameters folded in as numbers, differences of angles as
-  such, not in compact mode, the quicker of with and without `fast_math`; compilation not counted.
-  In a batch, groups of its recommended SIMD width.
-- SciPy, numba: the compiled right-hand side of `benchmarks/physics.py` in the compiled loops of
-  `ode` ("dop853") and `odeint` (LSODA): its best form. Plain: NumPy and `solve_ivp`, as users
-  write.
-- Tolerances are tried in steps of 10^(1/4), absolute and relative alike; the loosest that reaches
-  the error is taken, or, where none does, the one with the least error.
-"""
+- The reference solution is heyoka's in long double at a tolerance of 1e-19, with its dense output. At 17 times it agrees to 1e-14 or better with
+  `eomc.report.reference_solution`, a Gauss–Legendre method of order 40 in `__float128`.
+- Ours: the fastest of {methods}, each with the longest step that reaches the error, to 2 %; `simulate` and `simulate_batch` with all checks.
+- heyoka: the adaptive Taylor integrator with parameters as constants, not in compact mode, the faster one of with and
+  without `fast_math`; compilation is not counted. A batch uses groups of its recommended SIMD width.
+- SciPy, numba: the compiled right-hand side of `benchmarks/physics.py` in the compiled loops of `ode` ("dop853") and `odeint` (LSODA), its most efficient
+  form. Plain: NumPy and `solve_ivp`, the usual form.
+- Tolerances are tried in steps of 10^(1/4), absolute and relative alike. The loosest that reaches the error counts, or the one with the smallest error if
+  none does.
+"""  # noqa: E501
 
 
 def findings(lines: list[Line]) -> str:
     missed = [
-        f"{line.work} to {-math.log10(line.wanted):.0f} digits against {line.theirs.name} "
+        f"{line.work} to {-math.log10(line.wanted):.0f} digits, compared with {line.theirs.name} "
         f"({line.ratio[1]:.2g}, bar {line.bar:g})"
         for line in lines
         if not line.met

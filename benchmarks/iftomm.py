@@ -1,9 +1,10 @@
-"""A01 to A05 of the IFToMM library of benchmark problems, by its own criteria; writes IFTOMM.md.
+"""Run A01 to A05 of the IFToMM library with its error criteria; write IFTOMM.md.
 
     python benchmarks/iftomm.py [--only A02]
 
-The library gives of A01 and A02 the errors that it admits. Reference positions along those runs are
-of the same motion in one coordinate, whose ends are known to 30 digits (tests/data/cases.json).
+The library states admissible errors for A01 and A02. Reference positions along those runs are
+computed from the same motion in one coordinate, whose end is known to 30 digits
+(tests/data/cases.json).
 """
 
 from __future__ import annotations
@@ -167,7 +168,7 @@ def ways(p: Problem, wanted: float) -> Iterator[tuple[str, Callable[[], Any]]]:
 
 
 def line(p: Problem, name: str, wanted: float) -> str:
-    """Of the table: the quickest way to an admitted error."""
+    """Return a row of the table: the fastest run with an admissible error."""
     found = [(quick(run), told, run) for told, run in ways(p, wanted)]
     if not found:
         return f"| {p.name} | {name} | not reached | | | | {p.published} |"
@@ -181,7 +182,7 @@ def line(p: Problem, name: str, wanted: float) -> str:
 
 
 def drifted(p: Problem, run: Any) -> str:
-    """By how much the energy changes of what keeps it, J; Andrews' squeezer: less its motor's."""
+    """Return the largest change of the energy, J; for A03 minus the work of the motor."""
     given = 0.0
     if p.name.startswith("A03"):
         given = p.module.defaults["mom"] * (run.q[:, 0] - run.q[0, 0])
@@ -191,32 +192,28 @@ def drifted(p: Problem, run: Any) -> str:
 
 
 HEAD = """\
-# IFToMM A01 to A05
+# IFToMM benchmarks A01 to A05
 
-Written by `python benchmarks/iftomm.py`: the basic problems of the IFToMM library of multibody
-benchmarks, A01 to A04 by constraints. Times are of whole runs from Python with a row an output,
-the least of up to 15.
+Written by `python benchmarks/iftomm.py`: the basic problems of the IFToMM library of multibody benchmarks, A01 to A04 with constraints. Times of whole runs from
+Python with one row per output, the smallest of up to 15.
 
 {machine}
 
-| problem | admitted | quickest | error | energy | run | OpenSim 3.2 |
+| problem | admissible error | fastest | error | energy | run | OpenSim 3.2 |
 |---|---|---|---|---|---|---|
-"""
+"""  # noqa: E501
 TAIL = """
-- Admitted: of A01 and A02 the library's errors, {low:g} (low) and {high:g} (high), with 4000 and
-  400 outputs and a threshold of {threshold:g}: the root mean square, over outputs and numbers, of
-  errors in parts of the number or of the threshold. A01: the place of the point, A02: place and
-  velocity of B0. How the library takes the mean could not be read; so it is usually written.
-- Of A03, A04 and A05 the library's admitted errors could not be read, nor its files of results.
-  They stand with 1e-3: the end beside digits that are known, in parts of the largest coordinate; of
-  A03 at 0.03 s.
-- OpenSim 3.2: times published by the authors of MBS-BOS (i5-4570 at 3.2 GHz, Windows 8.1; A05's as
-  `tests/data/cases.json` has it), at its own accuracy, which is not the error here. Its A04 has
-  rods 0.1 m thick where ours are thin. Other times of the library could not be read. Times of
-  different processors: take the power of ten.
-- Energy: its largest change at the outputs; of A03 less what the motor gives. A05 loses energy in
-  its dampers, and has no constraints here: three coordinates by symmetry.
-"""
+- Admissible error: for A01 and A02 those of the library, {low:g} (low) and {high:g} (high), with 4000 and 400 outputs and a threshold of {threshold:g}: the root mean
+  square, over outputs and components, of errors relative to the component or to the threshold. A01: the position of the point, A02: position and velocity
+  of B0. The library's definition of the mean was not available; this is the usual one.
+- For A03, A04 and A05 neither the library's admissible errors nor its result files were available. They are listed with 1e-3: the final positions compared with a known
+  solution, relative to the largest coordinate; for A03 at 0.03 s.
+- OpenSim 3.2: times published by the authors of MBS-BOS (i5-4570 at 3.2 GHz, Windows 8.1; A05's as in `tests/data/cases.json`), at its own accuracy, which is not
+  the error in this table. Its A04 has rods 0.1 m thick, here they are thin. Other times of the library were not available. Because the processors differ, only the
+  order of magnitude is significant.
+- Energy: its largest change at the outputs; for A03 minus the work of the motor. A05 loses energy in its dampers, and has no constraints here: three coordinates by
+  symmetry.
+"""  # noqa: E501
 
 
 def main() -> None:

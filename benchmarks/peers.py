@@ -1,12 +1,12 @@
-"""Our steps against those of others, on the same physics; writes RESULTS.md and RESULTS.svg.
+"""Compare RK4 steps with those of other programs; write RESULTS.md and RESULTS.svg.
 
     python benchmarks/peers.py [--rounds 25] [--only WORD]
 
-All do the same: classical RK4 at the same fixed step on the same equations. Final states are
-compared first, and nothing is timed where they differ by more than 1e-9. Then all run in turns on
-one pinned core, and the ratio of our time to theirs is taken within each round. Integrators that
-choose their own steps are compared at the same error instead. Who runs: `runners.py`,
-`simulators.py`, `solvers.py`, `xla.py`, and our own kernels in `kernels.py`.
+All programs make steps of classical RK4 with the same fixed size on the same equations. Times are
+measured only if the final states differ by at most 1e-9. Then all run in turns on one pinned core,
+and the ratio of our time to theirs is computed within each round. Adaptive integrators are compared
+at the same error. The programs are in `runners.py`, `simulators.py`, `solvers.py`, `xla.py`, and
+hand-written kernels in `kernels.py`.
 """
 
 from __future__ import annotations
@@ -221,10 +221,10 @@ def same_error(name: str, end: float, wanted: float, root: Path, rounds: int) ->
     middle = np.median(times, axis=0)
     best = int(np.argmin(middle[: len(ours)]))
     lines = [
-        f"To an error of {wanted:g} over {end:g} s of the {name}; "
-        f"*ratio* is that of {list(found)[best]}.",
+        f"The {name} over {end:g} s with an error of at most {wanted:g}. "
+        f"*Ratio*: time of {list(found)[best]}, divided by that of the integrator.",
         "",
-        "| integrator | us | ratio | quartiles | chosen | error |",
+        "| integrator | us | ratio | quartiles | setting | error |",
         "|---|---|---|---|---|---|",
     ]
     for i, (title, (_, chosen)) in enumerate(found.items()):
@@ -238,53 +238,51 @@ def same_error(name: str, end: float, wanted: float, root: Path, rounds: int) ->
 # --- the page ------------------------------------------------------------------------------------
 
 HEAD = """\
-# Against others
+# Comparison with other programs
 
-Written by `python benchmarks/peers.py`. Classical RK4 at the same fixed step and on the same
-equations everywhere; the last states agree to 1e-9 (float32: 1e-3), or nothing would have been
-timed. Times in ns a step and instance, medians of {rounds} rounds in which all run in turns on one
-core; *ratio* is ours/theirs, the median and quartiles of the ratios within the rounds. Below 1 we
-are faster. *Bar*: what the ratio should be at most, and behind a comma what is hoped for. *Error*:
-the largest in a component of the last state after that many steps, against DOP853 at rtol 1e-13
-(of a batch: in its first four instances).
+Written by `python benchmarks/peers.py`. Classical RK4 with the same fixed step on the same equations in all programs; times are
+measured only if the final states agree to 1e-9 (float32: 1e-3).
+
+- *ours*, *theirs*: time in ns per step and instance, median of {rounds} rounds in which all programs run in turns on one core.
+- *Ratio*: ours/theirs, with median and quartiles of the ratios within the rounds. Below 1, eomc is faster.
+- *Bar*: the required ratio, followed by the desired one if there is one.
+- *Error*: the largest error of a component of the final state after that many steps, compared with DOP853 at rtol 1e-13 (of a batch: in its
+  first four instances).
 
 {machine}
 
 ![Each ratio with its quartiles and bar](RESULTS.svg)
 
-| work | against | ours | theirs | ratio | quartiles | bar | our error | their error | steps |
+| task | compared with | ours | theirs | ratio | quartiles | bar | our error | their error | steps |
 |---|---|---|---|---|---|---|---|---|---|
-"""
+"""  # noqa: E501
 TAIL = """
-- *By hand*: the right-hand side in `benchmarks/physics.py`, one sine and cosine an angle,
-  differences of angles by the addition theorem, straight-line LDL^T, parameters folded in as
-  numbers (ours are read at run time): the best form a peer can be given. The chains' scenes have
-  absolute angles too, with positions as definitions; *as bodies*: joints and relative angles.
-- *From SymPy*: D and the bias from the energies by SymPy, common subexpressions taken out, then the
-  same LDL^T: what a user of these has who writes energies, as ours do.
-- numba: RK4 in scalars in one compiled loop, `fastmath={"contract"}`, which allows FMA as gcc does
-  for us and nothing else. The wheel of llvmlite has no SVML, so its batch is not vectorised.
-- CasADi: the whole step as one SX function, its C compiled with our flags with and without
-  `-fno-tree-slp-vectorize` (the faster is kept), called from a loop in the same file.
-- heyoka: the whole step as one compiled function called on all 4,096 columns at once.
-- JAX: double precision, all steps as one `lax.scan` over a tuple of scalars, compiled whole; the
-  batch by `vmap` or `lax.map`, the faster. Chains are left out: XLA computes shared values again
-  for each use, some 2,500 ns a step for five links.
-- MuJoCo: integrator RK4, contacts, constraints and sensors switched off, the steps in its own loop.
-- mechanicsdsl: the C++ it writes, its output taken out, with our flags or those of its own CMake
-  file, the faster. Its step has vectors on the heap and the powers and sines as SymPy left them.
-- Panda: from the URDF of example-robot-data, fingers locked, joint friction included. Ours is the
-  scene that `eomc import` writes, its torque inputs (zero) included. Pinocchio: `aba` of the
-  wheel's library in a loop in C++, in the quicker of its two conventions. Compiled from its headers
-  with -O3 and -march=native, which takes minutes, `aba` was no faster.
-- Our kernels by hand: `benchmarks/kernels/`, the same method with every trick we know; by gcc or
-  clang, the faster.
-- Ours: `simulate` and `simulate_batch` from Python, all checks and copies included.
-- *Two processes, half each*: our batch in a process on either core at once, which is what the
-  machine has for two threads to reach.
-- At the same error: our steppers at the longest step, the others at the loosest tolerance, that end
-  within 1e-9 of the answer. JiTCODE's right-hand side is C with our flags, SciPy's is numba's.
-"""
+Conditions:
+
+- *By hand*: the right-hand side in `benchmarks/physics.py`, with one sine and cosine per angle, differences of angles by the addition theorem,
+  straight-line LDL^T, and parameters as constants (those of eomc are variables): the most efficient form for the other programs. The scenes of
+  the chains have absolute angles too, with positions as definitions; *as bodies*: joints and relative angles.
+- *From SymPy*: D and the bias from the energies by SymPy, with common subexpressions eliminated, then the same LDL^T: the form of a user who
+  starts from energies, as eomc does.
+- numba: RK4 with scalars in one compiled loop, `fastmath={"contract"}`, which only allows FMA, as gcc does for eomc. The wheel of llvmlite
+  has no SVML, so that its batch is not vectorised.
+- CasADi: the whole step as one SX function; its C is compiled with the flags of eomc with and without `-fno-tree-slp-vectorize` (the faster one
+  counts), and called from a loop in the same file.
+- heyoka: the whole step as one compiled function, called on all 4,096 columns at once.
+- JAX: double precision, all steps as one compiled `lax.scan` over a tuple of scalars; the batch by `vmap` or `lax.map`, the faster one. Chains
+  are left out: XLA recomputes shared values for each use, some 2,500 ns per step for five links.
+- MuJoCo: integrator RK4; contacts, constraints and sensors are disabled; the steps run in its own loop.
+- mechanicsdsl: its generated C++ without output, with the flags of eomc or those of its own CMake file, the faster ones. Its step allocates
+  vectors on the heap and uses powers and sines as written by SymPy.
+- Panda: from the URDF of example-robot-data with locked fingers and joint friction. eomc uses the scene that `eomc import` writes, with its torque
+  inputs (zero). Pinocchio: `aba` of the library in its wheel in a loop in C++, in the faster of its two conventions. Compiled from its
+  headers with -O3 and -march=native, which takes minutes, `aba` was not faster.
+- Our kernels by hand: `benchmarks/kernels/`, the same method with all known optimisations; by gcc or clang, the faster one.
+- Ours: `simulate` and `simulate_batch` from Python, including all checks and copies.
+- *Two processes, half each*: one process with a batch of half the size on each of two cores, the limit for two threads.
+- At the same error: methods of eomc with the longest step, the others with the loosest tolerance, that end within 1e-9 of the solution. JiTCODE's
+  right-hand side is C with the flags of eomc, SciPy's is numba's.
+"""  # noqa: E501
 PACKAGES = """eomc numba llvmlite casadi heyoka jax mujoco pin jitcode mechanicsdsl-core numpy scipy
 sympy""".split()
 
@@ -295,17 +293,17 @@ def machine() -> str:
 
 
 def findings(rows: list[Row]) -> str:
-    """Where a peer wins and which bars are missed, in words."""
+    """Return the summary: where another program is faster, and which bars are missed."""
 
     def told(row: Row) -> str:
-        return f"{row.work} against {row.peer.name} ({row.ratio[1]:.2g})"
+        return f"{row.work}, compared with {row.peer.name} ({row.ratio[1]:.2g})"
 
     wins = [told(r) for r in rows if r.ratio[1] > 1]
     missed = [f"{told(r)[:-1]}, bar {r.peer.bars[0]:g})" for r in rows if r.missed]
-    parts = (("A peer wins", wins), ("Bars missed", missed))
-    said = "".join(f"\n{title}: {'; '.join(lines) or 'nowhere'}.\n" for title, lines in parts)
+    parts = (("Another program is faster", wins), ("Bars missed", missed))
+    said = "".join(f"\n{title}: {'; '.join(lines) or 'none'}.\n" for title, lines in parts)
     if not any("two threads" in row.work for row in rows):
-        said += "\nTwo threads against one: not measured, no second core was free.\n"
+        said += "\nTwo threads compared with one: not measured, because no second core was free.\n"
     return said
 
 
@@ -327,7 +325,7 @@ def main() -> None:
         if options.only in "same error":
             said += same_error("double pendulum", 20.0, 1e-9, Path(root), options.rounds)
         if options.only in "calls":
-            said += "\n" + calls.said(Path(root), options.rounds)
+            said += "\n" + calls.table(Path(root), options.rounds)
     print(said, findings(rows), sep="")
     if not options.only:
         figure.draw([row.mark for row in rows], HERE / "RESULTS.svg")
