@@ -3,9 +3,9 @@
     python benchmarks/calls.py [--rounds 25]
 
 - A call of `simulate` or `simulate_batch`, compared with the C function with the same arguments and
-  rows. Both are processor times of the thread, so that other processes on the core do not count, and
-  the smallest of the rounds, which alternate. On a shared machine the times may differ by a factor of
-  up to 1.8, depending on whether the other hardware thread of the core is in use.
+  rows. Both are processor times of the thread, so that other processes on the core do not count,
+  and the smallest of the rounds, which alternate. On a shared machine the times may differ by a
+  factor of up to 1.8, depending on whether the other hardware thread of the core is in use.
 - `step_batch` of eight instances, including all checks, as in a learning loop.
 - The import of a built scene in a new process, with bytecode in place, after NumPy.
 """
