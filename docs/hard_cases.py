@@ -1,4 +1,4 @@
-"""Write docs/hard-cases.md: the best integration method and its error for each case of tests/data/cases.json.
+"""Write docs/hard-cases.md: the best method and its error for each case of tests/data/cases.json.
 
 python docs/hard_cases.py [CASE...]      write the table, or print the rows of these cases
 """
@@ -33,10 +33,11 @@ NEAR = 3.0  # the fastest run within this factor of the smallest error or the fl
 
 INTRODUCTION = """# Hard cases
 
-Systems with known solutions, and the accuracy of each integration method: every case of `tests/data/cases.json` without
-constraints, with every suitable method of order 4 and more, at h = t_end/2^k, within {longest:g} s of computing time. The
-table shows the fastest run whose error is within a factor of {near:g} of the smallest error, or of the floor if that is
-larger; a run whose error increases much with half the step is left out.
+Systems with known solutions, and the accuracy of each integration method: every case of
+`tests/data/cases.json` without constraints, with every suitable method of order 4 and more, at
+h = t_end/2^k, within {longest:g} s of computing time. The table shows the fastest run whose error
+is within a factor of {near:g} of the smallest error, or of the floor if that is larger; a run whose
+error increases much with half the step is left out.
 
 - *Error*: max |q - q_ref|/max(1, max |q_ref|) at the end, compared with a solution of 30 digits.
 - *Floor*: the effect of rounding the initial state to doubles (`double_floor`).
@@ -62,7 +63,7 @@ class Best:
 
 
 def best(name: str) -> Best | None:
-    """Return the fastest run near the smallest error or the floor; None if no run reaches the end."""
+    """Return the fastest run near the smallest error or the floor; None if none ends."""
     case = cases()[name]
     system = case_system(name)
     methods = tuple(m.name for m in METHODS.values() if m.order >= LEAST_ORDER)
