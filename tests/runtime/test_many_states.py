@@ -229,3 +229,9 @@ def test_zero_states_have_zero_values(crank: ModuleType) -> None:
     empty = np.empty((0, 3))
     assert crank.D(empty, t=np.empty(0), params={"m": np.empty(0)}).shape == (0, 3, 3)
     assert crank.acceleration(empty, empty, np.empty(0), np.empty((0, 1))).shape == (0, 3)
+
+
+def test_outputs_with_accelerations_take_any_number_of_states(crank: ModuleType) -> None:
+    """The accelerations are stored in an array for one state."""
+    q, qd = (np.tile(x, (5_000, 1)) for x in crank.start)
+    assert np.array_equal(crank.output(q, qd), np.tile(crank.output(*crank.start), (5_000, 1)))

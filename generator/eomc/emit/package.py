@@ -148,6 +148,8 @@ class Binding:
         rows = {kind.out: f"out + {extents[kind.out]}*k"} if kind.out else {}
         if kind.extra_argument:  # passed in place of the inputs
             rows[kind.extra_argument] = f"u + {member('own', 'u')}*k"
+        if public.takes_qdd(name):
+            rows["qdd"] = "qdd"  # a local array, for one state
         call = self.row_call(function, **rows)
         # functions for SciPy's LowLevelCallable take doubles only
         state_only = not kind.out and target.real is DOUBLE and not {"t", "u", "qdd"} & set(extents)
@@ -155,7 +157,7 @@ class Binding:
         return BoundFunction(
             name,
             call if kind.out else f"out[k] = {call}",
-            self.row_call(public.acceleration) if public.takes_qdd(name) else "",
+            self.row_call(public.acceleration, qdd="qdd") if public.takes_qdd(name) else "",
             at_call if state_only else "",
             extents[kind.out] if public.refuses(name) else "",
         )
