@@ -7,7 +7,7 @@ from fractions import Fraction
 import pytest
 from sympy import S
 
-from eomc.program.polynomial import MAX_BITS, MAX_EXPONENT, TooLargeError, _bounded
+from eomc.program.routes import MAX_BITS, MAX_EXPONENT, TooLargeError, _bounded
 
 
 def test_large_exponents_and_numbers_are_not_expanded() -> None:

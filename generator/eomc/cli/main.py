@@ -23,7 +23,7 @@ from eomc.cli.options import fail, say
 COMMANDS = {
     "build": "build", "check": "inspection", "dof": "inspection", "export": "build",
     "import": "scenes", "list": "scenes", "new": "scenes", "report": "inspection", "run": "run",
-    "schema": "scenes", "show": "inspection", "sweep": "sweep",
+    "schema": "scenes", "show": "inspection", "sweep": "run",
 }  # fmt: skip
 
 

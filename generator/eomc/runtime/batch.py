@@ -209,22 +209,23 @@ class BatchWork:
         initial state cannot be moved onto the constraints.
     first : int
         Number of steps from the start of the request to these states.
-    starts : (batch,) array, optional
-        Start time of each instance, s, if they differ.
 
     Attributes
     ----------
+    starts : (batch,) array, optional
+        Start time of each instance, s, if they differ.
     results : structured array (batch,)
         Counters and status of each instance, where C writes them.
     """
 
+    starts: Array | None = None
+
     def __init__(
         self, model: CompiledBatchModel, request: Request, state: Any, rows: Array | None = None,
         times: Array | None = None, codes: Array | None = None, *, first: int = 0,
-        starts: Array | None = None,
     ) -> None:  # fmt: skip
         self.model, self.request, self.state, self.rows = model, request, state, rows
-        self.times, self.starts, self.first = times, starts, first
+        self.times, self.first = times, first
         self.count, self.is_equal, ffi = len(state[0]), request.has_equal_steps, model.c.ffi
         self.u = request.u
         if self.is_equal and self.u is not None and self.u.shape[1] > 1:
@@ -764,7 +765,8 @@ class Batch(Component):
             t0 = as_number(t, "t") if times is None else 0.0
             inputs_and_method = (inputs, 0.0, 0, table, method)
             request = Request(q, qd, t0, 0.0, h, steps, 1, None, *inputs_and_method)
-            work = BatchWork(self.model, request, (q, qd), starts=times)
+            work = BatchWork(self.model, request, (q, qd))
+            work.starts = times
             if not work.run(threads, None):
                 raise KeyboardInterrupt
             return np.array(work.results["status"])
