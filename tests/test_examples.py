@@ -23,6 +23,9 @@ needs_gymnasium = pytest.mark.skipif(
 needs_scipy = pytest.mark.skipif(
     importlib.util.find_spec("scipy") is None, reason="SciPy is not installed"
 )
+needs_casadi = pytest.mark.skipif(
+    importlib.util.find_spec("casadi") is None, reason="CasADi is not installed"
+)
 
 
 @cache
@@ -76,6 +79,18 @@ def test_pole_is_swung_up() -> None:
     x, y = numbers(text, r"tip is at (\S+) m, (\S+) m")
     assert abs(x) < 1e-3 and y == pytest.approx(1, abs=1e-3)
     assert 0 < numbers(text, r"saturated (\d+)%")[0] < 50
+
+
+@needs_casadi
+@pytest.mark.slow
+def test_model_predictive_control_keeps_the_double_pendulum_upright() -> None:
+    text = run_script("mpc.py")
+    assert "75 problems of 181 variables: Solve_Succeeded," in text
+    mean, most = numbers(text, r"(\S+) iterations each, at most (\d+)")
+    assert 3 <= mean <= most <= 12
+    travel, force = numbers(text, r"up to (\S+) m, force up to (\S+) N")
+    assert travel < 0.8 and 5 < force <= 30
+    assert all(abs(x) < 0.05 for x in numbers(text, r"= (\S+) m, a1 = (\S+) rad, a2 = (\S+) rad"))
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from eomc.base.errors import EomcError, SceneError
 from eomc.base.resources import __version__
-from eomc.pipeline import build, export_fmu, load, read, sources
+from eomc.pipeline import build, export, export_fmu, load, read, sources
 
 if TYPE_CHECKING:
     from eomc.model.system import System, dot
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from eomc.sweeps.sweep import sweep
 
 __all__ = [
-    "EomcError", "SceneError", "System", "__version__", "build", "dot", "equations", "export_fmu",
-    "load", "read", "sources", "sweep",
+    "EomcError", "SceneError", "System", "__version__", "build", "dot", "equations", "export",
+    "export_fmu", "load", "read", "sources", "sweep",
 ]  # fmt: skip
 
 

@@ -166,6 +166,80 @@ def export_fmu(
     return fmu.export(fmu_files, Path(f"{fmu_files.name}.fmu" if out is None else out), binary)
 
 
+def export(
+    scene: ScenePath | System,
+    library: str,
+    folder: ScenePath | None = None,
+    *,
+    h: float | None = None,
+    warn: Callable[[Problem], None] | None = None,
+) -> Path:
+    """Export a scene or a System as a package for a library of optimisation; return its folder.
+
+    Parameters
+    ----------
+    scene
+        Path of the TOML file, or a System.
+    library
+        "casadi": accelerations as symbolic expressions in Python; accelerations and steps as
+        compiled external functions with Jacobians.
+    folder
+        Folder of the package, by default <name of the scene>_<library> in the current folder. Files
+        that eomc did not write are not replaced.
+    h
+        Step size of exported steps, s; by default that of the scene.
+    warn
+        Function that is called with each warning; by default warnings are discarded.
+
+    Raises
+    ------
+    SceneError
+        If the scene is invalid, or has events or no derivatives.
+    EomcError
+        If anything else fails.
+    """
+    from eomc.emit import exports, render
+    from eomc.toolchain.files import write_c_folder
+
+    _refuse_other(scene, "" if folder is None else folder)
+    if library not in exports.LIBRARIES:
+        raise EomcError(f"give one of {', '.join(exports.LIBRARIES)}, here {library!r}")
+    system = read(scene) if isinstance(scene, (str, os.PathLike)) else scene
+    system = exports.differentiable(system, library, h)
+    program = _program(system, warn)
+    folder = Path(f"{system.name}_{library}" if folder is None else folder)
+    texts = render.casadi_package(program)
+    write_c_folder(texts, folder)
+    _write_library(f"{system.name}_{library}", texts, program, folder, warn)
+    return folder
+
+
+def _write_library(
+    name: str, texts: Mapping[str, str], program: Program, folder: Path,
+    warn: Callable[[Problem], None] | None,
+) -> None:  # fmt: skip
+    """Compile the C files among `texts` to a shared library `name` in a folder.
+
+    Without a compiler a warning is issued.
+    """
+    from eomc.base.errors import Problem, writing
+    from eomc.program.outline import weight
+    from eomc.runtime.atomic_write import atomic_write
+    from eomc.toolchain import compiler
+
+    sources = [file for file in texts if file.endswith(".c")]
+    try:
+        chosen = compiler.compiler_for(sum(map(weight, program.functions.values())))
+    except NoCompilerError as fault:
+        if warn is not None:
+            warn(Problem(f"sources only: {fault}", severity="warning"))
+        return
+    binary = compiler.compile_library(chosen, name, texts, sources, f"{program.system.name}_ode")
+    file = folder / f"{name}{compiler.SUFFIX}"
+    with writing(file), atomic_write(file) as new:
+        new.write_bytes(binary)
+
+
 def build(
     scene: ScenePath | System,
     root: ScenePath = "build",

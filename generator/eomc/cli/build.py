@@ -136,6 +136,7 @@ def export_command() -> None:
 
     \b
     eomc export fmu scenes/cartpole.toml
+    eomc export casadi scenes/cartpole.toml
     """
 
 
@@ -163,3 +164,34 @@ def export_fmu(scene: Path, fmi: str, out: Path | None, sources: bool, quiet: bo
     if not quiet:
         inside = f"sources and a binary for {exported.binary}" if exported.binary else "sources"
         say(f"{escape_line(exported.file)}: FMI {fmi}.0, {inside}")
+
+
+def _export_package(library: str, title: str, description: str) -> None:
+    """Add the command that exports a scene as a package for a library of optimisation."""
+
+    @export_command.command(
+        library,
+        help=f"{description}\n\n\b\neomc export {library} scenes/cartpole.toml",
+        short_help=title,
+    )
+    @options.SCENE
+    @click.option(
+        "--out",
+        type=click.Path(path_type=Path),
+        help=f"Folder of the package, by default NAME_{library}.",
+    )
+    @click.option("--step-size", "h", type=float, help="Step size, s, by default the scene's h.")
+    @options.QUIET
+    def command(scene: Path, out: Path | None, h: float | None, quiet: bool) -> None:
+        with status_line("exporting", quiet):
+            folder = pipeline.export(scene, library, out, h=h, warn=warn)
+        if not quiet:
+            say(f"{escape_line(folder)}/: import it as {escape_line(folder.name)}")
+
+
+_export_package(
+    "casadi",
+    "Write a package for CasADi.",
+    "Write a package for CasADi: the accelerations as SX expressions, for IPOPT and acados, and "
+    "accelerations and steps as compiled external functions with Jacobians.",
+)

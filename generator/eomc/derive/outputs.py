@@ -227,7 +227,7 @@ def _slopes(
     except NotDifferentiableError:
         jump, smooth = STICKS if system.modes else JUMPS
         message = (
-            f"{jump}, so they have no derivatives: {smooth}, or do without linearize and the "
-            "implicit methods"
+            f"{jump}, so they have no derivatives: {smooth}, or do without derivatives "
+            "(linearize, exports) and the implicit methods"
         )
         raise SceneError([system.problem("run", message)]) from None

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from eomc.base import resources
 from eomc.base.texts import name as plain
-from eomc.emit import package, portable, selftest
+from eomc.emit import exports, package, portable, selftest
 from eomc.emit.common import c_function as c
 from eomc.emit.common.c_expression import REALS
 from eomc.emit.common.c_names import Target, rename_for_c
@@ -130,3 +130,13 @@ def unit(program: Program, version: int) -> Unit:
     functions = SceneFunctions(Target(program, REALS[program.system.run.real], written))
     files = portable.files(program, written=written)
     return render_unit(functions, version, files)
+
+
+def casadi_package(program: Program) -> dict[str, str]:
+    """Return the package of a program for CasADi, as texts by file name: portable C, functions with
+    CasADi's calling convention on top of it, and the accelerations in Python.
+    """
+    _plain_names(program)
+    program, written = rename_for_c(program)
+    functions = SceneFunctions(Target(program, REALS[program.system.run.real], written))
+    return {**portable.files(program, written=written), **exports.casadi_files(functions)}

@@ -10,7 +10,8 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
@@ -18,6 +19,7 @@ from pathlib import Path
 from types import FrameType
 
 from eomc.base.errors import EomcError, NoCompilerError
+from eomc.toolchain.files import write_files
 
 # no -ffast-math, which breaks the reduction of angles and the checks for singular D
 FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-tree-slp-vectorize")
@@ -26,6 +28,8 @@ STANDARD = "-std=gnu99"  # c99 would forbid the contraction to FMA
 PLAIN_STANDARD, PLAIN_FLAGS = "-std=c99", ("-O2",)
 # above it gcc takes more than some twenty seconds (0.3 ms per operation), clang two thirds of that
 MANY_OPERATIONS = 60_000
+# of shared libraries on this system
+SUFFIX = {"win32": ".dll", "cygwin": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 
 
 @dataclass(frozen=True)
@@ -212,6 +216,37 @@ def try_load(
             f"{name}: the C compiler {shlex.join(command)} returned 0, but what it made can't be "
             f"loaded: correct CC and EOMC_CFLAGS{remedy}\n  {last_line}"
         )
+
+
+def compile_library(
+    compiler: Compiler, name: str, files: Mapping[str, str], sources: Sequence[str], symbol: str,
+    remedy: str = "",
+) -> bytes:  # fmt: skip
+    """Compile portable C to a shared library in a temporary folder; return its bytes.
+
+    Parameters
+    ----------
+    compiler, name
+        The compiler; the scene's name, for messages.
+    files, sources
+        Texts by path, of which C sources and headers are used; paths of the sources to compile.
+    symbol
+        Function that the library must contain.
+    remedy
+        Text at the end of the error message if the library can't be loaded.
+    """
+    library = name + SUFFIX
+    with tempfile.TemporaryDirectory(prefix="eomc-") as folder_name:
+        folder = Path(folder_name)
+        write_files({n: text for n, text in files.items() if n.endswith((".c", ".h"))}, folder)
+        command = [
+            *compiler.command, standard("plain"), *flags("plain"), "-fPIC", "-fvisibility=hidden",
+            "-shared", *sources, "-lm", "-o", library,
+        ]  # fmt: skip
+        run(name, folder, command)
+        load = f"import ctypes; ctypes.CDLL({str(folder / library)!r}).{symbol}"
+        try_load(name, compiler.command, load, (), remedy)
+        return (folder / library).read_bytes()
 
 
 @contextmanager

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import platform
 import sys
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from eomc.base.errors import EomcError, NoCompilerError
-from eomc.toolchain.compiler import Compiler, compiler_for, flags, run, standard, try_load
-from eomc.toolchain.files import write_archive, write_files
+from eomc.toolchain.compiler import SUFFIX, Compiler, compile_library, compiler_for
+from eomc.toolchain.files import write_archive
 
 if TYPE_CHECKING:
     from eomc.emit.fmu import Unit
 
-_SUFFIX = {"win32": ".dll", "cygwin": ".dll", "darwin": ".dylib"}
 _MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}
 
 
@@ -70,19 +68,11 @@ def binary_folder(version: int) -> str:
 
 
 def _compile(unit: Unit, compiler: Compiler) -> tuple[dict[str, bytes], str]:
-    library = unit.name + _SUFFIX.get(sys.platform, ".so")
+    library = f"{unit.name}{SUFFIX}"
     folder = binary_folder(unit.version)
-    with tempfile.TemporaryDirectory(prefix="eomc-fmu-") as folder_name:
-        sources = Path(folder_name, "sources")
-        write_files(
-            {n: text for n, text in unit.files.items() if n.endswith((".c", ".h"))},
-            Path(folder_name),
-        )
-        command = [
-            *compiler.command, standard("plain"), *flags("plain"), "-fPIC", "-fvisibility=hidden",
-            "-shared", *unit.sources, "-lm", "-o", library,
-        ]  # fmt: skip
-        run(unit.name, sources, command)
-        load = f"import ctypes; ctypes.CDLL({str(sources / library)!r}).fmi{unit.version}GetVersion"
-        try_load(unit.name, compiler.command, load, (), ", or take --sources")
-        return {f"binaries/{folder}/{library}": (sources / library).read_bytes()}, folder
+    files = {n.removeprefix("sources/"): text for n, text in unit.files.items()}
+    binary = compile_library(
+        compiler, unit.name, files, unit.sources, f"fmi{unit.version}GetVersion",
+        ", or take --sources",
+    )  # fmt: skip
+    return {f"binaries/{folder}/{library}": binary}, folder

@@ -1,0 +1,280 @@
+"""Exported packages: their functions beside those of the scene's module, and their derivatives.
+
+The reference of derivatives is the automatic differentiation of the library that the package is
+for, applied to the accelerations that are written line by line.
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+import subprocess
+import sys
+import tempfile
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from support.cases import SCENES
+from support.fmus import plain
+from support.session import EVERYTHING, ROOT, tiers
+
+import eomc
+from eomc.base.errors import EomcError, SceneError
+from eomc.cli.main import main
+from eomc.model.system import System, from_scene
+from eomc.scene.read import parse
+
+FOLDER = Path(tempfile.mkdtemp(prefix="eomc-exports-"))  # of this process
+# every function that has a derivative, with names that the package uses itself
+SMOOTH = EVERYTHING.replace("-gamma*sign(theta_dot)/10 + push*heaviside(x)", "push*abs(x_dot)")
+FALLS = """
+eomc = 1
+name = "falls"
+[coordinates]
+y = { unit = "m", start = 1.0 }
+[energy]
+kinetic = "y_dot**2/2"
+potential = "9.81*y"
+"""
+
+
+def name_of(scene: str) -> str:
+    """Return the name of a scene, of a file in scenes/ or of a text."""
+    return scene.split('"')[1] if "\n" in scene else scene
+
+
+def system_of(scene: str) -> System:
+    text = scene if "\n" in scene else (SCENES / f"{scene}.toml").read_text(encoding="utf-8")
+    return from_scene(parse(text, "test.toml"))
+
+
+@cache
+def exported(scene: str, library: str) -> ModuleType:
+    """Export a scene once and import the package."""
+    pytest.importorskip(library, reason=f"no {library}: pip install '.[{library}]'")
+    system = system_of(scene)
+    if system.constraints:
+        system = eomc.read(SCENES / f"{scene}.toml")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("EOMC_CFLAGS", "-O0 -Wall -Wextra -Wpedantic -Werror")
+        folder = eomc.export(system, library, FOLDER / f"{system.name}_{library}")
+        patch.syspath_prepend(str(FOLDER))
+        return importlib.import_module(folder.name)
+
+
+def random_point(module: ModuleType, seed: int) -> tuple[np.ndarray, ...]:
+    """Return x = [q; qd], u and p near the start of the scene."""
+    rng = np.random.default_rng(seed)
+    start, p = (np.array(x, float).ravel() for x in (module.start, module.defaults))
+    x = start + 0.1 * rng.standard_normal(start.size)
+    return x, rng.standard_normal(module.nu), p * (1 + 0.05 * rng.random(p.size))
+
+
+def inputs_of(module: ModuleType, u: np.ndarray) -> np.ndarray | None:
+    """Return the inputs as a module takes them: None if the scene has none."""
+    return u if module.nu else None
+
+
+def dense(value: Any) -> np.ndarray:
+    """Return a matrix of CasADi as an array."""
+    import casadi
+
+    return casadi.DM(value).full()
+
+
+def largest_error(values: Any, expected: Any) -> float:
+    """Return the largest difference, relative to the largest expected value."""
+    expected = np.asarray(expected, float)
+    return float(np.abs(np.asarray(values, float) - expected).max() / np.abs(expected).max())
+
+
+CASADI_SCENES = ["cartpole_driven", SMOOTH, "kapitza_pendulum", "quadrotor", "four_bar", "chain"]
+casadi_scenes = pytest.mark.parametrize(
+    "scene", tiers(CASADI_SCENES, *CASADI_SCENES[:2]), ids=name_of
+)
+
+
+@casadi_scenes
+def test_accelerations_for_casadi_agree_with_the_module(scene: str) -> None:
+    package, module = exported(scene, "casadi"), plain(scene)
+    for seed in range(5):
+        x, u, p = random_point(package, seed)
+        q, qd = np.split(x, 2)
+        expected = np.concatenate([qd, module.acceleration(q, qd, 0.3, inputs_of(module, u), p)])
+        for function, tolerance in ((package.compiled("ode"), 0.0), (package.function(), 1e-13)):
+            assert largest_error(dense(function(x, u, p, 0.3)).ravel(), expected) <= tolerance
+    assert package.coordinates == tuple(module.coordinates)
+    assert (
+        dict(zip(package.parameters, dense(package.defaults).ravel(), strict=True))
+        == module.defaults
+    )
+
+
+@casadi_scenes
+def test_compiled_jacobians_agree_with_those_of_symbolic_accelerations(scene: str) -> None:
+    import casadi
+
+    package = exported(scene, "casadi")
+    x, u, p = random_point(package, 7)
+    arguments = [casadi.MX.sym(n, len(v)) for n, v in zip("xupt", (x, u, p, [0.0]), strict=True)]
+    jacobians = []
+    for f in (package.compiled("ode"), package.function()):
+        blocks = [casadi.jacobian(f(*arguments), a) for a in arguments[:3]]
+        function = casadi.Function("jacobians", arguments, blocks)
+        jacobians.append([dense(block) for block in function(x, u, p, 0.3)])
+    for compiled, symbolic in zip(*jacobians, strict=True):
+        assert compiled.shape == symbolic.shape
+        assert not symbolic.size or largest_error(compiled, symbolic) < 1e-12
+    assert jacobians[0][0].shape == (2 * package.nq,) * 2
+
+
+@pytest.mark.parametrize(
+    "scene", tiers(["cartpole_driven", "kapitza_pendulum", SMOOTH], "cartpole_driven"), ids=name_of
+)
+def test_step_for_casadi_agrees_with_the_module_and_with_symbolic_derivatives(scene: str) -> None:
+    import casadi
+
+    package, module = exported(scene, "casadi"), plain(scene)
+    step, f, h, t = package.compiled("step"), package.function(), package.h, 0.3
+    x, u, p = random_point(package, 3)
+    q, qd = np.split(x, 2)
+    assert np.array_equal(
+        dense(step(x, u, p, t)).ravel(),
+        np.concatenate(module.step(q, qd, h, t, inputs_of(module, u), p)),
+    )
+    symbols = [casadi.SX.sym(n, len(v)) for n, v in zip("xup", (x, u, p), strict=True)]
+    state, control, parameters = symbols
+    k1 = f(state, control, parameters, t)
+    k2 = f(state + h / 2 * k1, control, parameters, t + h / 2)
+    k3 = f(state + h / 2 * k2, control, parameters, t + h / 2)
+    k4 = f(state + h * k3, control, parameters, t + h)
+    end = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    blocks = [casadi.jacobian(end, v) for v in symbols]
+    expected = casadi.Function("derivatives", symbols, blocks)(x, u, p)
+    for block, symbolic in zip(step.jacobian()(x, u, p, t, 0)[:3], expected, strict=True):
+        assert not symbolic.numel() or largest_error(dense(block), dense(symbolic)) < 1e-13
+
+
+@casadi_scenes
+def test_adjoints_agree_with_jacobians(scene: str) -> None:
+    package = exported(scene, "casadi")
+    f, (x, u, p) = package.compiled("ode"), random_point(package, 5)
+    weights = np.linspace(0.5, 1.5, len(x))
+    adjoints = f.reverse(1)(x, u, p, 0.3, 0, weights)
+    for adjoint, block in zip(adjoints[:3], f.jacobian()(x, u, p, 0.3, 0)[:3], strict=True):
+        assert not block.numel() or largest_error(dense(adjoint).T, weights @ dense(block)) < 1e-12
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", ["quadrotor", "four_bar"])
+def test_step_for_casadi_ends_on_the_constraints(scene: str) -> None:
+    """Derivatives are those of the step with its projection, here beside central differences."""
+    package, module = exported(scene, "casadi"), plain(scene)
+    step, h, t, d = package.compiled("step"), package.h, 0.0, 1e-6
+    x, u, p = dense(package.start).ravel(), np.full(package.nu, 0.5), package.defaults
+    q, qd = np.split(x, 2)
+    end = dense(step(x, u, p, t)).ravel()
+    assert np.array_equal(end, np.concatenate(module.step(q, qd, h, t, inputs_of(module, u))))
+    assert np.abs(module.constraints(*np.split(end, 2))).max() < 1e-12
+    columns = [
+        dense(step(x + e, u, p, t) - step(x - e, u, p, t)).ravel() for e in d * np.eye(len(x))
+    ]
+    assert (
+        largest_error(dense(step.jacobian()(x, u, p, t, 0)[0]), np.array(columns).T / 2 / d) < 1e-8
+    )
+
+
+def test_states_without_accelerations_are_reported_to_casadi() -> None:
+    package = exported("cartpole_driven", "casadi")
+    x, u, p = random_point(package, 1)
+    for function in (package.compiled("ode"), package.compiled("ode").jacobian()):
+        arguments = {"x": x, "u": u, "p": -p}
+        with pytest.raises(RuntimeError, match="valuation"):
+            function(**arguments)
+
+
+def test_step_size_of_an_export_is_chosen(tmp_path: Path) -> None:
+    pytest.importorskip("casadi")
+    result = CliRunner().invoke(
+        main,
+        ["export", "casadi", str(SCENES / "simple_pendulum.toml"), "--step-size", "0.05", "--out",
+         str(tmp_path / "longer")],
+        env={"EOMC_CFLAGS": "-O0"},
+    )  # fmt: skip
+    assert result.exit_code == 0 and result.output.endswith("import it as longer\n")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(tmp_path))
+        package = importlib.import_module("longer")
+    q, qd = plain("simple_pendulum").step([0.4], [0.1], h=0.05)
+    assert np.array_equal(
+        dense(package.compiled("step")([0.4, 0.1], [], package.defaults, 0)).ravel(), [*q, *qd]
+    )
+    assert package.h == 0.05
+
+
+@pytest.mark.parametrize("library", ["casadi"])
+def test_what_has_no_derivatives_is_refused_by_name(library: str, tmp_path: Path) -> None:
+    scene = tmp_path / "scene.toml"
+    event = '[[event]]\nname = "ground"\nwhen = "y"\naction = "stop"\n'
+    sign = '[forces]\ny = "-sign(y_dot)"\n'
+    for text, message in (
+        (FALLS + event, "the event 'ground' interrupts a run"),
+        (FALLS + sign, "make them smooth, say tanh"),
+    ):
+        scene.write_text(text, encoding="utf-8")
+        with pytest.raises(SceneError, match=message):
+            eomc.export(scene, library, tmp_path / "folder")
+    scene.write_text(FALLS, encoding="utf-8")
+    for words, message in (
+        (["--step-size", "-1"], "the step size is a positive number of seconds"),
+        (["--out", str(tmp_path)], "has files that eomc did not write"),
+    ):
+        (tmp_path / "__init__.py").write_text("mine = 1\n", encoding="utf-8")
+        result = CliRunner().invoke(main, ["export", library, str(scene), *words])
+        assert result.exit_code == 2 and message in result.output, result.output
+    with pytest.raises(EomcError, match="one of casadi"):
+        eomc.export(scene, "tensorflow", tmp_path / "folder")
+    assert not (tmp_path / "folder").exists()
+
+
+def test_export_without_a_compiler_writes_the_sources(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    messages: list[Any] = []
+    folder = eomc.export(
+        system_of("simple_pendulum"), "casadi", tmp_path / "p", warn=messages.append
+    )
+    assert [m.message for m in messages] and "sources only: no C compiler" in messages[-1].message
+    assert {file.name for file in folder.iterdir()} == {
+        "__init__.py", "simple_pendulum.c", "simple_pendulum.h", "simple_pendulum_casadi.c",
+    }  # fmt: skip
+
+
+def run_page(library: str, folder: Path) -> None:
+    """Run the commands and the Python of a section of docs/optimisation.md in a folder."""
+    page = (ROOT / "docs" / "optimisation.md").read_text(encoding="utf-8")
+    section = re.split(r"^## ", page, flags=re.M)
+    (text,) = [s for s in section if s.partition("\n")[0] == library]
+    commands, program = (re.findall(rf"```{k}\n(.*?)```", text, re.S)[0] for k in ("sh", "python"))
+    for command in commands.splitlines():
+        result = CliRunner().invoke(main, command.split()[1:], env={"EOMC_CFLAGS": "-O0"})
+        assert result.exit_code == 0, result.output
+    process = subprocess.run(
+        [sys.executable, "-W", "error", "-c", program], cwd=folder, capture_output=True, text=True
+    )
+    assert (process.returncode, process.stderr) == (0, ""), process.stderr
+
+
+@pytest.mark.slow
+def test_page_about_casadi_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("casadi", reason="no casadi: pip install '.[casadi]'")
+    monkeypatch.chdir(tmp_path)
+    run_page("CasADi", tmp_path)
