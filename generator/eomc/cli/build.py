@@ -23,17 +23,17 @@ from eomc.cli.options import escape_line, say, status_line, warn
     "folder",
     metavar="DIR",
     type=click.Path(path_type=Path),
-    help="Write only the C, into DIR: no compiler is needed, and no Python module made.",
+    help="Write only the C into DIR, without a compiler and without a Python module.",
 )
 @click.option(
     "--prefix",
     metavar="NAME",
-    help="With --c: what names and files begin with, to have two versions in one program.",
+    help="With --c: prefix of names and files, for two versions in one program.",
 )
 @click.option(
     "--wheel",
     is_flag=True,
-    help="Write a wheel of the module here, for pip; it needs NumPy and cffi, and no eomc.",
+    help="Write a wheel of the module for pip; it requires NumPy and cffi, but not eomc.",
 )
 @options.QUIET
 @options.JSON
@@ -132,7 +132,7 @@ def _write_c(
 
 @click.group("export")
 def export_command() -> None:
-    """Write a scene for other programs.
+    """Export a scene to other programs.
 
     \b
     eomc export fmu scenes/cartpole.toml
@@ -144,13 +144,13 @@ def export_command() -> None:
 @options.SCENE
 @click.option(
     "--fmi", type=click.Choice(["2", "3"]), default="2", show_default=True,
-    help="Version 2.0, which most tools read, or 3.0.",
+    help="FMI version: 2.0, which most tools read, or 3.0.",
 )  # fmt: skip
-@click.option("--out", type=click.Path(path_type=Path), help="The file, by default NAME.fmu.")
-@click.option("--sources", is_flag=True, help="Sources only, no binary.")
+@click.option("--out", type=click.Path(path_type=Path), help="The FMU; by default NAME.fmu.")
+@click.option("--sources", is_flag=True, help="Sources only, without a binary.")
 @options.QUIET
 def export_fmu(scene: Path, fmi: str, out: Path | None, sources: bool, quiet: bool) -> None:
-    """Write a unit of FMI: co-simulation and model exchange, binary and source.
+    """Write an FMU: co-simulation and model exchange, binary and source.
 
     \b
     eomc export fmu scenes/cartpole.toml

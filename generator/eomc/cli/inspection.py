@@ -21,11 +21,10 @@ from eomc.toolchain import cache
 @options.SCENE
 @options.JSON
 def dof_command(scene: Path, as_json: bool) -> None:
-    """Count a scene's freedoms, from its bodies and joints, and say which are redundant.
+    """Count degrees of freedom of bodies and joints, and report redundant coordinates.
 
-    Of a scene with constraints or loops also the rank of their rows and the freedoms that they
-    leave, which rows are redundant, how near the start is to a singular position, and with one
-    freedom its whole way, and where it is assembled.
+    For constraints and loops: their rank, redundant equations, the remaining degrees of freedom,
+    the assembled initial state, and the distance to singular positions.
 
     \b
     eomc dof scenes/arm.toml
@@ -66,17 +65,22 @@ def dof_command(scene: Path, as_json: bool) -> None:
 @click.command("show")
 @options.SCENE
 @options.BUILD
-@click.option("--latex", "form", flag_value="latex", help="LaTeX, for amsmath.")
+@click.option("--latex", "form", flag_value="latex", help="Print LaTeX for amsmath.")
 @click.option(
-    "--python", "form", flag_value="python", help="Python source that makes the matrices."
+    "--python",
+    "form",
+    flag_value="python",
+    help="Print Python source that defines the SymPy matrices.",
 )
-@click.option("--cost", "form", flag_value="cost", help="Operations of each generated function.")
+@click.option(
+    "--cost", "form", flag_value="cost", help="Print the operations of each generated function."
+)
 @click.option(
     "--sizes", "form", flag_value="sizes",
-    help="Bytes of code and stack of each function of the plain C, as $CC makes them by -Os.",
+    help="Print bytes of code and stack of the portable C, compiled by $CC with -Os.",
 )  # fmt: skip
 def show_command(scene: Path, root: Path, form: str | None) -> None:
-    """Print the equations of motion, L, D, C, g and the rest, as text for a terminal.
+    """Print the equations of motion, L, D, C and g as text.
 
     \b
     eomc show scenes/cartpole.toml
@@ -138,16 +142,20 @@ def _sizes(scene: Path) -> str:
 @options.SCENES
 @options.BUILD
 @click.option(
-    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the random states."
+    "--seed",
+    type=click.IntRange(0),
+    default=0,
+    show_default=True,
+    help="Seed of the random states.",
 )
 @options.QUIET
 @options.JSON
 def check_command(
     scenes: Sequence[Path], root: Path, seed: int, quiet: bool, as_json: bool
 ) -> None:
-    """Compare the compiled module with the pure-Python reference, and test what must hold.
+    """Compare the compiled code with a pure-Python reference, and test laws of mechanics.
 
-    So too the portable form of C, compiled for this; the first time in some seconds.
+    The portable form of C is compiled and compared too.
 
     \b
     eomc check scenes/*.toml
@@ -179,16 +187,20 @@ def check_command(
 @click.command("report")
 @options.SCENES
 @options.BUILD
-@click.option("--digits", type=click.IntRange(1, 17), help="Recommend for so many digits only.")
-@click.option("--json", "file", type=click.Path(path_type=Path), help="Write all figures to FILE.")
+@click.option(
+    "--digits",
+    type=click.IntRange(1, 17),
+    help="Recommend a method and h for this number of digits only.",
+)
+@click.option("--json", "file", type=click.Path(path_type=Path), help="Write all results to FILE.")
 @options.QUIET
 def report_command(
     scenes: Sequence[Path], root: Path, digits: int | None, file: Path | None, quiet: bool
 ) -> None:
-    """Measure what every digit costs: each stepper over a range of h, against 25 digits or more.
+    """Measure error and time of each integration method over a range of h.
 
-    Writes a page, build/NAME/report.html: what the scene is, its equations and motion, then speed
-    against error.
+    Writes a page, build/NAME/report.html, with the scene, its equations and motion, and a table of
+    error and time. Errors are measured with a reference solution of 25 digits or more.
 
     \b
     eomc report scenes/cartpole.toml

@@ -77,13 +77,13 @@ def error_text(fault: EomcError) -> str:
 @click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="eomc")
 def main() -> None:
-    """The equations-of-motion compiler: from energies to fast, checked C.
+    """Derive equations of motion; generate C and Python code and simulate.
 
     \b
     eomc new pendulum              write a scene to start from
     eomc import robot.urdf         write the scene of a robot file
     eomc run pendulum.toml         derive, compile and simulate it
-    eomc check pendulum.toml       compare it with the independent reference
+    eomc check pendulum.toml       compare the code with an independent reference
     """
 
 

@@ -103,37 +103,42 @@ class Simulation:
 @click.command("run", cls=_RunCommand)
 @options.SCENE
 @options.BUILD
-@click.option("--set", "parameters", multiple=True, metavar="NAME=VALUE", help="A parameter.")
 @click.option(
-    "--start", multiple=True, metavar="NAME=VALUE", help="A coordinate, or its velocity NAME_dot."
+    "--set", "parameters", multiple=True, metavar="NAME=VALUE", help="Value of a parameter."
+)
+@click.option(
+    "--start",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="Initial value of a coordinate, or of its velocity NAME_dot.",
 )
 @click.option(
     "--input", "inputs", multiple=True, metavar="NAME=VALUE",
-    help="An input, held; the others have the scene's values.",
+    help="Constant value of an input; the others have the scene's signals.",
 )  # fmt: skip
 @click.option("--h", "h", type=float, help="Step size in s, instead of the scene's.")
-@click.option("--duration", type=float, help="In s, instead of the scene's.")
-@click.option("--method", help="A stepper that the scene asks for, its first by default, or auto.")
+@click.option("--duration", type=float, help="Duration in s, instead of the scene's.")
+@click.option("--method", help="Integration method of the scene, or auto; by default its first.")
 @click.option("--tol", type=float, help="Tolerance of adaptive steps, instead of the scene's.")
 @click.option(
-    "--event", multiple=True, metavar="NAME=FORMULA", help="Tell when a formula crosses zero."
+    "--event", multiple=True, metavar="NAME=FORMULA", help="Print when a formula crosses zero."
 )
-@click.option("--every", type=click.IntRange(1), default=1, help="Keep every so many steps.")
+@click.option("--every", type=click.IntRange(1), default=1, help="Store every N-th step.")
 @click.option(
     "--out", type=click.Path(path_type=Path), help="Write the rows: FILE.csv or FILE.npz."
 )
-@click.option("--plot", type=click.Path(path_type=Path), help="Draw them: FILE.png, .svg or .pdf.")
-@click.option("--wrap", is_flag=True, help="Angles from -pi to pi in --plot.")
+@click.option("--plot", type=click.Path(path_type=Path), help="Plot them: FILE.png, .svg or .pdf.")
+@click.option("--wrap", is_flag=True, help="Draw angles from -pi to pi in --plot.")
 @click.option(
     "--animate",
     type=click.Path(path_type=Path),
-    help="Let them move: FILE.html, a page that plays them; FILE.gif or .mp4, a film.",
+    help="Animate them: FILE.html, a page; FILE.gif or .mp4, a film.",
 )
 @options.QUIET
 @options.JSON
 @options.parse_into(RunArguments)
 def run_command(arguments: RunArguments) -> None:
-    """Simulate a scene; print the end, the error and the speed.
+    """Simulate a scene; print the final state, its error and the speed.
 
     \b
     eomc run scenes/cartpole.toml --plot cartpole.png
@@ -472,10 +477,10 @@ MAX_BYTES = 10 * 10**9  # of a store that is created without --yes
 
 @click.command("sweep")
 @click.argument("file", type=click.Path(path_type=Path))
-@click.option("--over", multiple=True, metavar="NAME=A:B:N", help="An axis; or NAME=A,B,C.")
+@click.option("--over", multiple=True, metavar="NAME=A:B:N", help="A grid axis; or NAME=A,B,C.")
 @click.option(
     "--draw", "draws", multiple=True, metavar="NAME=KIND:A,B",
-    help="A drawn quantity, such as m=normal:2,0.1 or l=uniform:0,1.",
+    help="A random quantity, such as m=normal:2,0.1 or l=uniform:0,1.",
 )  # fmt: skip
 @click.option("--n", type=click.IntRange(1), help="Number of draws, such as 10_000.")
 @click.option("--sampler", help="random, sobol or latin.")
@@ -484,21 +489,25 @@ MAX_BYTES = 10 * 10**9  # of a store that is created without --yes
 @click.option("--duration", type=float, help="Simulated time, s.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder of the store.")
 @click.option("--workers", type=click.IntRange(1), help="Number of processes.")
-@click.option("--scheduler", metavar="ADDRESS", help="Dask's scheduler, such as tcp://host:8786.")
-@click.option("--threads", type=click.IntRange(1), help="Threads of C for a block.")
+@click.option(
+    "--scheduler", metavar="ADDRESS", help="Address of Dask's scheduler, such as tcp://host:8786."
+)
+@click.option("--threads", type=click.IntRange(1), help="Number of threads for each block.")
 @click.option("--part", metavar="K/N", help="Compute the K-th of N parts, for an array of jobs.")
-@click.option("--status", is_flag=True, help="Print what is finished, and compute nothing.")
-@click.option("--plot", type=click.Path(path_type=Path), help="Draw the first quantity into FILE.")
-@click.option("--parquet", type=click.Path(path_type=Path), help="Write the values into DIR.")
-@click.option("--yes", is_flag=True, help="Create a store of more than 10 GB.")
+@click.option(
+    "--status", is_flag=True, help="Print the number of finished blocks, without computing."
+)
+@click.option("--plot", type=click.Path(path_type=Path), help="Plot the first quantity into FILE.")
+@click.option("--parquet", type=click.Path(path_type=Path), help="Write Parquet files into DIR.")
+@click.option("--yes", is_flag=True, help="Allow a store of more than 10 GB.")
 @options.QUIET
 @options.JSON
 @options.parse_into(SimpleNamespace)
 def sweep_command(command: SimpleNamespace) -> None:
-    """Simulate a scene for many values of its quantities, into a store on disk.
+    """Simulate a scene for many values of its quantities; store the results on disk.
 
-    FILE is the file of a sweep, or a scene with --over or --draw. The same command goes on with a
-    sweep that was interrupted.
+    FILE is the file of a sweep, or a scene with --over or --draw. The same command continues an
+    interrupted sweep.
 
     \b
     eomc sweep basin.toml --plot basin.png

@@ -29,12 +29,12 @@ DEFAULT = "pendulum"  # name of the template's scene
 @click.argument("name", required=False)
 @click.option(
     "--from", "source", metavar="SCENE",
-    help="A scene that comes with eomc, as 'eomc list' has them; by default a driven pendulum.",
+    help="A scene listed by 'eomc list'; by default a driven pendulum.",
 )  # fmt: skip
 def new_command(name: str | None, source: str | None) -> None:
-    """Write a scene to start from: scenes/NAME.toml, or NAME.toml where there is no scenes/.
+    """Write a scene to start from: scenes/NAME.toml, or NAME.toml if there is no scenes/.
 
-    NAME is by default what the scene is called that it starts from.
+    NAME is by default the name of the copied scene.
 
     \b
     eomc new crane
@@ -102,31 +102,48 @@ class ImportArguments:
 @click.command("import")
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option(
-    "--out", type=click.Path(path_type=Path), help="The scene; by default as eomc new has it."
+    "--out",
+    type=click.Path(path_type=Path),
+    help="The scene; by default scenes/NAME.toml, or NAME.toml if there is no scenes/.",
 )
-@click.option("--name", help="Of the scene, instead of the robot's.")
+@click.option("--name", help="Name of the scene, instead of the robot's.")
 @click.option(
-    "--lock", "locks", multiple=True, metavar="JOINT=VALUE", help="Freeze a joint, at rad or m."
+    "--lock",
+    "locks",
+    multiple=True,
+    metavar="JOINT=VALUE",
+    help="Fix a joint at a value in rad or m.",
 )
-@click.option("--root", metavar="LINK", default="", help="Keep what this link carries, fix it.")
+@click.option(
+    "--root",
+    metavar="LINK",
+    default="",
+    help="Keep this link, fixed to the world, and the links that it carries.",
+)
 @click.option("--tip", metavar="LINK", default="", help="Keep the chain that ends in this link.")
 @click.option(
-    "--base", type=click.Choice(["fixed", "free"]), help="Of the root, instead of the file's."
+    "--base",
+    type=click.Choice(["fixed", "free"]),
+    help="Base of the robot: free (floating) or fixed, instead of the file's.",
 )
-@click.option("--no-drives", is_flag=True, help="No input for each joint.")
+@click.option("--no-drives", is_flag=True, help="Write no inputs.")
 @click.option(
-    "--mend-inertias", is_flag=True, help="Take the nearest inertia for one that no body can have."
+    "--mend-inertias",
+    is_flag=True,
+    help="Replace impossible inertia tensors by the nearest possible ones.",
 )
-@click.option("--stops", is_flag=True, help="Let limits of joints push back, as stops do.")
-@click.option("--limits", is_flag=True, help="Let limits of drives act, as limits of inputs.")
+@click.option("--stops", is_flag=True, help="Position limits of joints become stops.")
+@click.option("--limits", is_flag=True, help="Limits of drives become limits of inputs.")
 @click.option(
     "--parameters", type=click.Choice(["masses"]),
-    help="Make the masses parameters, with a payload at each tip.",
+    help="masses: masses become parameters, with a payload at each tip.",
 )  # fmt: skip
-@click.option("--include", is_flag=True, help="Open what <include> names, in the file's folder.")
+@click.option(
+    "--include", is_flag=True, help="Open the files that <include> names, in the file's folder."
+)
 @options.parse_into(ImportArguments)
 def import_command(arguments: ImportArguments) -> None:
-    """Write the scene of a robot file, URDF or MJCF, and say what it leaves out.
+    """Write the scene of a robot file, URDF or MJCF, and report what is left out.
 
     \b
     eomc import panda.urdf --lock panda_finger_joint1=0.04
@@ -210,7 +227,7 @@ def _edit_robot(robot: Robot, arguments: ImportArguments) -> Robot:
 @click.command("schema")
 @click.option("--out", type=click.Path(path_type=Path), help="Write the schema to this file.")
 def schema_command(out: Path | None) -> None:
-    """Print the JSON Schema of scenes, with which editors complete and check keys.
+    """Print the JSON Schema of scenes, for completion and checks in editors.
 
     \b
     eomc schema --out scene.schema.json
@@ -238,7 +255,7 @@ Row = dict[str, Any]
 def list_command(folders: Sequence[Path], root: Path, as_json: bool) -> None:
     """List the scenes in scenes/, or in the given folders, and whether they are built.
 
-    Without a folder, those that come with eomc follow: 'eomc new --from NAME' writes one here.
+    Without a folder, the scenes of eomc are listed too; 'eomc new --from NAME' copies one.
 
     \b
     eomc list
