@@ -218,11 +218,7 @@ class Integrator(Component):
         hold = None if control_period is None else as_period(control_period, h)
         method = self.info.method_name(method)
         lib = self.c.lib
-        if not hasattr(lib, f"{method}_derivative"):
-            raise ValueError(
-                f"discretize: {self.info.name} was built without it: build it with "
-                f"{option('discretize')}"
-            )
+        self._require_derivatives("discretize")
         functions = self.model.functions
         count = len(self.info.parameters) if hasattr(lib, "sensitivity") else 0
         if as_flag(parameters, "parameters") and not count:
@@ -258,6 +254,72 @@ class Integrator(Component):
         if u_p is not None:
             E += Gamma @ u_p
         return (Phi, Gamma, E) if parameters else (Phi, Gamma)
+
+    def _require_derivatives(self, name: str) -> None:
+        """Raise ValueError if the module has no derivatives of steps; name: the caller."""
+        if not hasattr(self.c.lib, f"{self.info.methods[0]}_derivative"):
+            raise ValueError(
+                f"{name}: {self.info.name} was built without it: build it with "
+                f"{option('discretize')}"
+            )
+
+    def propagate(
+        self, rows: tuple[Array, Array], times: Array, u: Array | None, p: Array, h: float,
+        method: str, *, has_rows: bool,
+    ) -> tuple[Array, Array, Array]:  # fmt: skip
+        """Return the derivatives of the states at given times by the first state, u and p.
+
+        They are the products of the derivatives of the steps.
+
+        Parameters
+        ----------
+        rows : tuple of two (n, nq) arrays
+            q and qd. Those after the first row are computed, unless `has_rows`.
+        times : (n,) array
+            Ascending times of the rows, s. Between two of them there are steps of equal size.
+        u : (nu,) or (n, nu) array, or None
+            Inputs, constant or from each row to the next; None: the scene's signals.
+        p : (np,) array
+            Parameters.
+        h : float
+            Largest step size, s.
+        method : str
+            Name of the method.
+        has_rows : bool
+            Whether the steps after each row start from its given state.
+
+        Returns
+        -------
+        Phi, Gamma, E : (n, 2 nq, 2 nq), (n, 2 nq, nu) and (n, 2 nq, np) arrays
+            Derivatives by the first state, by a constant that is added to the inputs, and by the
+            parameters; np is 0 if the module has no derivatives by them.
+
+        Raises
+        ------
+        MotionError
+            If a step fails or a derivative is not finite.
+        ValueError
+            If the module was built without derivatives of steps.
+        """
+        self._require_derivatives("sensitivity")
+        info, pointer, count, size = self.info, self.c.pointer, len(times), 2 * self.info.nq
+        widths = size, info.nu, len(info.parameters) if hasattr(self.c.lib, "sensitivity") else 0
+        matrices = [np.zeros((count, size, width), info.dtype) for width in widths]
+        matrices[0][:1] = np.eye(size)
+        u_step = u.shape[-1] if u is not None and u.ndim == 2 else 0
+        clock, function = np.ascontiguousarray(times, float), f"{method}_sensitivity"
+        steps = 1 + (clock[-1] - clock[0]) / h / count
+        for k, many in slices(count - 1, int(_STEPS // (steps * info.nq**3)) + 1):
+            code = getattr(self.c.lib, function)(
+                many + 1, *(pointer(x[k:]) if x.size else self.c.null for x in matrices),
+                *(pointer(x[k:]) for x in rows), has_rows,
+                self.c.ffi.from_buffer("double *", clock[k:]), h,
+                self.c.null if u is None else pointer(u[k:] if u_step else u), u_step, pointer(p),
+            )  # fmt: skip
+            if code & 7:
+                at = k + (code >> 3)
+                _refuse(rows[0][at], rows[1][at], clock[at], 0, STATUS[code & 7])
+        return matrices[0], matrices[1], matrices[2]
 
     def simulate(
         self, q0: Start = None, qd0: Start = None, h: float | None = None,

@@ -22,6 +22,7 @@ from .status import STATUS_MESSAGES, Interrupted, MotionError, state_text
 
 if TYPE_CHECKING:
     from .balance import Balance
+    from .sensitivity import Sensitivity
 
 
 @dataclass(eq=False, repr=False)
@@ -326,6 +327,43 @@ class Trajectory(Columns):
         from .balance import balance
 
         return balance(self)
+
+    def sensitivity(
+        self, *, outputs: bool = False, h: float | None = None, method: str | None = None
+    ) -> Sensitivity:
+        """Return forward sensitivities: the derivatives of the rows by start, inputs, parameters.
+
+        They are the products of the derivatives of the steps from row to row, exact to rounding for
+        a run by fixed steps.
+
+        Parameters
+        ----------
+        outputs : bool
+            Return the derivatives of the scene's outputs instead of those of the states.
+        h, method : float, str, optional
+            Largest step size, s, and name of the method; by default those of the run. By default a
+            run by adaptive steps takes those of the scene; its sensitivities then have the error of
+            these steps.
+
+        Returns
+        -------
+        Sensitivity
+            Derivatives `start` (n, 2 nq, 2 nq) by the initial state [q; qd], `inputs`
+            (n, 2 nq, nu) by a constant that is added to each input over the whole run, and
+            `parameters` (n, 2 nq, np) at a constant initial state. With `outputs` there are ny
+            instead of 2 nq rows.
+
+        Raises
+        ------
+        MotionError
+            If a derivative is not finite.
+        ValueError
+            If the module was built without derivatives of steps, the state jumps at an event, or
+            the inputs are a function.
+        """
+        from .sensitivity import sensitivity
+
+        return sensitivity(self, outputs, h, method)
 
     def plot(
         self, *names: str, phase: Any = None, section: Mapping[str, Array] | None = None,
