@@ -36,7 +36,7 @@ class Sensitivity(NamedTuple):
     parameters: Array
 
 
-def sensitivity(run: Trajectory, outputs: bool, h: float | None, method: str | None) -> Sensitivity:
+def sensitivity(run: Any, outputs: bool, h: float | None, method: str | None) -> Sensitivity:
     """Return the derivatives of the rows of a run; see `Trajectory.sensitivity`."""
     model, request, info = run.model, run.request, run.model.info
     if as_flag(outputs, "outputs") and not info.outputs:
