@@ -19,9 +19,8 @@ from support.scene_author import scene_text
 from eomc.base.errors import SceneError
 from eomc.cli.main import main
 from eomc.scene import schema
-from eomc.scene.json_schema import json_schema
 from eomc.scene.read import parse
-from eomc.scene.schema import Key
+from eomc.scene.schema import Key, json_schema
 
 jsonschema = pytest.importorskip("jsonschema", reason="jsonschema is not installed")
 SCHEMA = json_schema()

@@ -232,7 +232,7 @@ def schema_command(out: Path | None) -> None:
     \b
     eomc schema --out scene.schema.json
     """
-    from eomc.scene.json_schema import json_schema
+    from eomc.scene.schema import json_schema
 
     text = json.dumps(json_schema(), indent=1)
     if out is None:

@@ -419,9 +419,6 @@ def _repair_tables(tree: dict[str, Any], check: Checker) -> None:
                 check.repaired.add(("energy",))
 
 
-TABLES = (  # whose entries may be repeated
-    "constants", "parameters", "coordinates", "inputs", "definitions", "forces", "constraints",
-)  # fmt: skip
 _PLAIN = ("definitions", "forces")  # tables with formulas as entries
 _WORDS = ("unit", "note", "title", "repeat")  # keys with free text
 # no formulas
@@ -468,10 +465,10 @@ class _Expansion:
                 self.check.report((written,), f"{unknown}write [[{array_name}]]")
                 self.tree[array_name] = entries
                 self.check.places.rename((written,), (array_name,))
-        for table in TABLES:
+        for table in schema.REPEATABLE_TABLES:
             if isinstance(self.tree.get(table), dict):
                 self.declared |= dict.fromkeys(self.tree[table], table)
-        for table in TABLES:
+        for table in schema.REPEATABLE_TABLES:
             if isinstance(self.tree.get(table), dict):
                 self.tree[table] = self._expand_table(table, self.tree[table])
         for array in ARRAYS:

@@ -17,6 +17,7 @@ from eomc.base.errors import SceneError
 from eomc.scene import hints
 from eomc.scene.formulas import Value, nearest
 from eomc.scene.scope import UNKNOWN, Checker, Path
+from eomc.scene.toml_text import ARRAYS
 from eomc.scene.value_types import (
     Place,
     Solid,
@@ -770,3 +771,74 @@ def _intended_key(known: Sequence[str], name: str, path: Path) -> str:
     # a table's entries are judged by what it is taken for: 'damping' is no 'spring'
     is_unrelated = not path and near != alias and not nearest(name, [near], 0.7)
     return "" if is_unrelated else near
+
+
+REPEATABLE_TABLES = (  # whose entries may be repeated
+    "constants", "parameters", "coordinates", "inputs", "definitions", "forces", "constraints",
+)  # fmt: skip
+# the latest version that editors of TOML support in full
+JSON_SCHEMA_DIALECT = "http://json-schema.org/draft-07/schema#"
+REPEAT_KEY = {
+    "type": "string",
+    "pattern": r"=.*\.\.",
+    "description": 'Range over which the entry is repeated, such as "i = 1..n".',
+}
+
+
+def json_schema() -> dict[str, Any]:
+    """Return the JSON Schema of a scene file as a dict.
+
+    It accepts every valid scene. Rules that depend on other entries of a scene, such as which names
+    a formula may use, are checked by `eomc build` alone.
+    """
+    scene = _table_schema(Document)
+    for name in REPEATABLE_TABLES:
+        value = scene["properties"][name]["additionalProperties"]
+        tables = [x for x in value.get("anyOf", [value]) if x.get("type") == "object"]
+        for one in tables:
+            one["properties"]["repeat"] = REPEAT_KEY
+        if not tables:  # formulas
+            repeated = {
+                "type": "object",
+                "properties": {"repeat": REPEAT_KEY, "value": value},
+                "required": ["repeat", "value"],
+                "additionalProperties": False,
+            }
+            scene["properties"][name]["additionalProperties"] = {"anyOf": [value, repeated]}
+    for name in ARRAYS:
+        scene["properties"][name]["items"]["properties"]["repeat"] = REPEAT_KEY
+    return {"$schema": JSON_SCHEMA_DIALECT, "title": "Scene of eomc", **scene}
+
+
+def _table_schema(model: type) -> dict[str, Any]:
+    own = keys(model)
+    required = [name for name, key in own.items() if key.missing and not key.unless]
+    jump = "jump" in model.__dataclass_fields__  # type: ignore[attr-defined]
+    out = {
+        "type": "object",
+        "properties": {name: _property_schema(key) for name, key in own.items()},
+        "required": required,
+        "additionalProperties": entry.json_schema if jump else False,
+    }
+    for name, key in own.items():
+        if key.unless and key.table:  # a required table
+            condition = {"not": {"required": [key.unless]}}
+            out |= {"if": condition, "then": {"required": [name], "properties": {
+                name: {"required": [k for k, x in keys(key.table).items() if x.missing]}
+            }}}  # fmt: skip
+    return out
+
+
+def _property_schema(key: Key) -> dict[str, Any]:
+    unit = f" [{key.unit}]" if key.unit else ""
+    description = {"description": f"{key.about}{unit}"}
+    value: dict[str, Any] = dict(key.type.json_schema) if key.type else _table_schema(key.table)
+    if key.short:
+        value = {"anyOf": [entry.json_schema, value]}
+    if key.container == "table":
+        value = {"type": "object", "additionalProperties": value}
+        if key.missing:
+            value["minProperties"] = 1
+    elif key.container == "array":
+        value = {"type": "array", "items": value}
+    return description | value
