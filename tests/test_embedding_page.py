@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from support.pages import follow
 from support.session import ROOT, needs
 
 pytestmark = pytest.mark.slow
 PAGE = (ROOT / "docs" / "embedding.md").read_text(encoding="utf-8")
 EXAMPLES = ROOT / "docs" / "examples"
 SECTIONS = dict(re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", PAGE, re.MULTILINE | re.DOTALL))
-# a file, commands, or their output
-BLOCK = re.compile(r"(?:^`([\w./]+)`:\n\n)?^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 TOOLS = {
     "In a C program": ["cc"],
     "In a CMake project": ["cmake", "g++", "pkg-config"],
@@ -26,26 +22,6 @@ TOOLS = {
     "A control loop": ["cc"],
     "A Python wheel": ["cc"],
 }
-
-
-def run_section(section: str, folder: Path) -> str:
-    """Run the section's commands, and compare with the printed output; return all output."""
-    output = whole = ""
-    here = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    for file, language, text in BLOCK.findall(SECTIONS[section]):
-        if file:
-            (folder / file).write_text(text, encoding="utf-8")
-        elif language == "sh":
-            process = subprocess.run(
-                ["sh", "-e", "-c", text], cwd=folder, capture_output=True, text=True,
-                env={**os.environ, "PATH": here}, stdin=subprocess.DEVNULL, timeout=500,
-            )  # fmt: skip
-            assert process.returncode == 0, process.stdout + process.stderr
-            output = process.stdout
-            whole += output
-        elif language == "text":
-            assert output.replace("\r", "").endswith(text), output
-    return whole
 
 
 def test_every_section_is_run() -> None:
@@ -62,7 +38,7 @@ def test_section_works_as_documented(section: str, tmp_path: Path) -> None:
         pytest.importorskip("scipy")
         for file in (*(EXAMPLES / "control_loop").iterdir(), EXAMPLES / "balance.toml"):
             shutil.copy(file, tmp_path)
-    output = run_section(section, tmp_path)
+    output = follow(SECTIONS[section], tmp_path)
     if section == "A control loop":
         match = re.search(r"angle within (\S+) rad, its rate known to (\S+) rad/s", output)
         assert match and float(match[1]) < 2e-3 and float(match[2]) < 2e-3, output
