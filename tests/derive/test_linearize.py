@@ -70,7 +70,15 @@ def with_derivatives(scene: str) -> ModuleType:
 @pytest.mark.parametrize(
     "scene",
     tiers(
-        ("cartpole_driven", "kapitza_pendulum", "chain", "tumbling_box", "suspension", "acrobot"),
+        (
+            "cartpole_driven",
+            "kapitza_pendulum",
+            "chain",
+            "tumbling_box",
+            "suspension",
+            "acrobot",
+            "cartpole_bodies",
+        ),
         "cartpole_driven",
     ),
 )

@@ -9,17 +9,14 @@ articulated bias forces need no velocity terms of their own.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations_with_replacement
 
 from sympy import Expr, S
 
-from eomc.derive.newton_euler import AXES, ZERO, Inertia, TreeDynamics, Vector
+from eomc.derive.newton_euler import ZERO, Inertia, Rows, TreeDynamics, Vector, symmetric_matrix
 from eomc.derive.tape import Stage
-from eomc.model.tree import Matrix
 
-Rows = list[list[Expr]]
 Column = tuple[Sequence[Expr], Sequence[Expr]]  # U = I s of a joint axis s: moment, force
 Pairs = tuple[tuple[Expr, Expr], ...]
 
@@ -185,8 +182,8 @@ class _Articulated:
         def minus_product(old: Expr, a: Expr, b: Expr) -> Expr:
             return V.add(old, V.minus(V.times(a, b)))
 
-        J = self._symmetric(lambda i, j: minus_product(body.J[i][j], w_m[i], u_m[j]))
-        M = self._symmetric(lambda i, j: minus_product(body.M[i][j], w_f[i], u_f[j]))
+        J = symmetric_matrix(lambda i, j: minus_product(body.J[i][j], w_m[i], u_m[j]))
+        M = symmetric_matrix(lambda i, j: minus_product(body.M[i][j], w_f[i], u_f[j]))
         H = [[minus_product(body.H[i][j], w_m[i], u_f[j]) for j in range(3)] for i in range(3)]
         if self.dynamics.armature[k] == 0:
             a = link.axis
@@ -196,13 +193,6 @@ class _Articulated:
                 elif link.angular == 0:
                     M[a][i] = M[i][a] = H[i][a] = S.Zero
         return _Inertia(J, H, M)
-
-    def _symmetric(self, entry: Callable[[int, int], Expr]) -> Rows:
-        """Return the symmetric 3 x 3 matrix with the given upper triangle."""
-        rows = [[S.Zero] * 3 for _ in range(3)]
-        for i, j in combinations_with_replacement(range(3), 2):
-            rows[i][j] = rows[j][i] = entry(i, j)
-        return rows
 
     def _sum(self, first: _Inertia, second: _Inertia) -> _Inertia:
         """Return the sum of two inertias about the same origin in the same frame."""
@@ -220,13 +210,8 @@ class _Articulated:
     def _to_parent_frame(self, k: int, x: _Inertia) -> _Inertia:
         """Transform an inertia from link k's frame to its parent's frame and origin."""
         V, tree = self.vectors, self.tree
-        if tree.angular[k] != 0:
-            x = _Inertia(*(self._rotate_by_joint(k, m) for m in (x.J, x.H, x.M)))
-        R = tree.rotation[k]
-        if not all(R[i][j] == (i == j) for i in range(3) for j in range(3)):
-            x = _Inertia(
-                *(self._rotate(R, m, same) for m, same in ((x.J, True), (x.H, False), (x.M, True)))
-            )
+        pairs = ((x.J, True), (x.H, False), (x.M, True))
+        x = _Inertia(*(self.dynamics.matrix_to_parent(k, m, symmetric) for m, symmetric in pairs))
         arm = tree.arm[k]
         if arm == ZERO:
             return x
@@ -234,37 +219,7 @@ class _Articulated:
         H = [[V.add(x.H[i][j], columns[j][i]) for j in range(3)] for i in range(3)]
         from_right = [V.cross(row, arm) for row in H]
         from_left = [V.cross(arm, row) for row in x.H]
-        J = self._symmetric(
+        J = symmetric_matrix(
             lambda i, j: V.add(x.J[i][j], V.minus(from_right[i][j]), from_left[j][i])
         )
         return _Inertia(J, H, x.M)
-
-    def _rotate_by_joint(self, k: int, m: Rows) -> Rows:
-        """Return R m R^T, where R is the rotation by joint k's angle."""
-        V = self.vectors
-        i, j = AXES[self.links[k].axis]
-        a = self.links[k].axis
-        out = [list(row) for row in m]
-        across = V.add(m[i][j], m[j][i])
-        t, off = self.dynamics.half_turn(k, m[i][i], m[j][j], across)
-        change = V.add(off, V.minus(across))
-        out[i][i], out[j][j] = V.add(m[i][i], V.minus(t)), V.add(m[j][j], t)
-        out[i][j], out[j][i] = V.add(m[i][j], change), V.add(m[j][i], change)
-
-        def rotated(x: Expr, y: Expr) -> tuple[Expr, Expr]:
-            v = list(ZERO)
-            v[i], v[j] = x, y
-            v = list(self.tree.rotate(k, (v[0], v[1], v[2])))
-            return v[i], v[j]
-
-        out[a][i], out[a][j] = rotated(m[a][i], m[a][j])
-        out[i][a], out[j][a] = rotated(m[i][a], m[j][a])
-        return out
-
-    def _rotate(self, R: Matrix, m: Rows, symmetric: bool) -> Rows:
-        """Return R m R^T."""
-        V = self.vectors
-        columns = list(zip(*(V.apply(R, row) for row in m), strict=True))  # columns of m R^T
-        if symmetric:
-            return self._symmetric(lambda i, j: V.dot(R[i], columns[j]))
-        return [[V.dot(row, column) for column in columns] for row in R]

@@ -210,7 +210,7 @@ def _rough_rows(system: System) -> list[Problem]:
 def _by_lagrange(system: System) -> tuple[EquationsOfMotion, SolveResult, SolveResult]:
     """Return the equations, and the accelerations by L D L^T and by link multipliers."""
     e = energies_on_tape(system, system.kinetic, system.potential)
-    motion = _lagrange(system, e)
+    motion = derive_motion_terms(system, e)
     if system.constraints:
         result = equations(system, e, motion)
         _refuse_massless(system, motion.D, result.rows)
@@ -237,7 +237,7 @@ def _by_newton_euler(
     """
     e = energies_on_tape(system, tree.other_kinetic, tree.other_potential)
     tape, q = e.tape, system.q
-    rest = _lagrange(system, e)
+    rest = derive_motion_terms(system, e)
     dynamics = TreeDynamics(tape, tree)
 
     def by_coordinate(by_link: Sequence[Expr]) -> list[Expr]:
@@ -364,7 +364,7 @@ def _sums(tape: Tape, first: Sequence[Expr], second: Sequence[Expr]) -> Vector:
 # --- Lagrange's operator --------------------------------------------------------------------------
 
 
-def _lagrange(system: System, e: Energies) -> MotionTerms:
+def derive_motion_terms(system: System, e: Energies) -> MotionTerms:
     """Derive D, bias, g, tau and b = tau - bias of the energies on a tape."""
     tape, q, qd = e.tape, system.q, system.qd
     w = list(e.points)

@@ -56,6 +56,39 @@ class Solution:
 SolveResult = Solution | str | None
 
 
+@dataclass(frozen=True)
+class Factors:
+    """Factors L diag(d) L^T of a symmetric matrix, as atoms of the attribute `tape`.
+
+    A tape is a list of elementary operations, each with a named result. An atom is a number, a name
+    on the tape, or a number times a name.
+
+    Attributes
+    ----------
+    steps
+        For each elimination step, in order: the index of the row, the inverse of its pivot, and the
+        column of L below the pivot.
+    pivots : Pairs
+        For each step: the pivot, and the diagonal entry from which it is computed.
+    """
+
+    tape: Tape
+    steps: tuple[tuple[int, Expr, Mapping[int, Expr]], ...]
+    pivots: Pairs
+
+    def solve(self, b: Sequence[Expr], short: Callable[[Expr], Expr] = lambda atom: atom) -> Vector:
+        """Return the solution x of L diag(d) L^T x = b. `short` is the argument of `factorize`."""
+        tape, y = self.tape, list(b)
+        for k, _, factors in self.steps:
+            for i, factor in factors.items():
+                y[i] = short(tape.define(y[i] - factor * y[k]))
+        x: dict[int, Expr] = {}
+        for k, inverse, factors in reversed(self.steps):
+            terms = [-factor * x[i] for i, factor in factors.items()]
+            x[k] = tape.define(sympy.Add(tape.define(y[k] * inverse), *map(tape.define, terms)))
+        return tuple(x[i] for i in range(len(y)))
+
+
 def solve(
     tape: Tape,
     D: Rows,
@@ -65,6 +98,22 @@ def solve(
     short_chains: bool = False,
 ) -> Solution:
     """Return the solution x of D x = b by L diag(d) L^T factorization, as symbolic expressions.
+
+    `b` is the right-hand side; the other arguments are those of `factorize`.
+    """
+    factors = factorize(tape, D, short, opaque, short_chains)
+    order = tuple(k for k, _, _ in factors.steps)
+    return Solution(tape, factors.solve(b, short), order, factors.pivots)
+
+
+def factorize(
+    tape: Tape,
+    D: Rows,
+    short: Callable[[Expr], Expr] = lambda atom: atom,
+    opaque: Callable[[Expr], Expr] = lambda atom: atom,
+    short_chains: bool = False,
+) -> Factors:
+    """Return the factors L diag(d) L^T of the symmetric matrix D, as symbolic expressions.
 
     Each operation is added to `tape`, a list of elementary operations with named results. Entries
     that are zero are neither stored nor computed with.
@@ -87,9 +136,9 @@ def solve(
     Parameters
     ----------
     tape : Tape
-        Receives the operations of the solution.
-    D, b
-        Symmetric matrix by rows, and right-hand side.
+        Receives the operations of the factorization.
+    D
+        Symmetric matrix by rows.
     short
         Function that is applied to intermediate results. It may return a shorter expression with
         the same value, in which terms that cancel are removed.
@@ -103,10 +152,9 @@ def solve(
     ----------
     Golub & Van Loan, *Matrix Computations*, 4th ed., alg. 4.1.2.
     """
-    n = len(b)
+    n = len(D)
     A = {(i, j): D[i][j] for i in range(n) for j in range(n) if D[i][j] != 0}
-    y = list(b)
-    remaining, order, pivots, chain_length = list(range(n)), [], [], [0] * n
+    remaining, pivots, chain_length = list(range(n)), [], [0] * n
     denominators, length = (
         [S.One] * n,
         [1] * n,
@@ -120,7 +168,6 @@ def solve(
 
         k = min(remaining, key=rank)
         remaining.remove(k)
-        order.append(k)
         pivot = A[k, k]
         pivots.append((pivot, tape.define(denominators[k] * D[k][k])))
         inverse = tape.define(denominators[k] / pivot)
@@ -130,7 +177,6 @@ def solve(
         factors = {i: opaque(tape.define(a * inverse)) for i, a in row.items()}
         chained = short_chains and len(row) == 1 and tape.stage_of(pivot) > Stage.PARAMETER
         for i, factor in factors.items():
-            y[i] = short(tape.define(y[i] - factor * y[k]))
             for j, a in row.items():
                 if j < i:
                     A[i, j] = A[j, i] = short(tape.define(A.get((i, j), S.Zero) - factor * a))
@@ -145,11 +191,7 @@ def solve(
             else:
                 A[i, i] = short(tape.define(A[i, i] - factor * a * denominators[i]))
         steps.append((k, inverse, factors))
-    x: dict[int, Expr] = {}
-    for k, inverse, factors in reversed(steps):
-        terms = [-factor * x[i] for i, factor in factors.items()]
-        x[k] = tape.define(sympy.Add(tape.define(y[k] * inverse), *map(tape.define, terms)))
-    return Solution(tape, tuple(x[i] for i in range(n)), tuple(order), tuple(pivots))
+    return Factors(tape, tuple(steps), tuple(pivots))
 
 
 def count_operations(D: Rows) -> int:

@@ -14,7 +14,7 @@ Robots*, ch. 9 (the matrix U, the grouping of inertial parameters).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 
@@ -28,6 +28,8 @@ from eomc.model.tree import Link, Matrix, Tree
 Vector = tuple[Expr, Expr, Expr]
 
 ZERO: Vector = (S.Zero, S.Zero, S.Zero)
+Rows = list[list[Expr]]
+
 AXES = ((1, 2), (2, 0), (0, 1))  # for each axis, the other two in cyclic order
 
 
@@ -89,6 +91,14 @@ class Vectors:
         return (a, b, c)
 
 
+def symmetric_matrix(entry: Callable[[int, int], Expr]) -> Rows:
+    """Return the symmetric 3 x 3 matrix with the given upper triangle."""
+    rows = [[S.Zero] * 3 for _ in range(3)]
+    for i, j in combinations_with_replacement(range(3), 2):
+        rows[i][j] = rows[j][i] = entry(i, j)
+    return rows
+
+
 class LinkFrames:
     """Frames of the links of a kinematic tree, parents before children, as symbolic expressions.
 
@@ -146,16 +156,19 @@ class LinkFrames:
         coordinates = {link.q for link in self.links if link.q.is_Symbol}
         return len(coordinates) == self.n
 
-    def project_forces(self, by_link: Iterable[Expr]) -> dict[Symbol, Expr]:
+    def project_forces(
+        self, by_link: Iterable[Expr], slopes: Sequence[Mapping[Symbol, Expr]] | None = None
+    ) -> dict[Symbol, Expr]:
         """Return the generalized force on each coordinate, from the force along each joint.
 
         `by_link` contains the force f_k (N) or moment (N m) along the joint of each link k. With
-        the joint's displacement s_k, the generalized force on q is sum_k ds_k/dq f_k.
+        the joint's displacement s_k, the generalized force on q is sum_k ds_k/dq f_k. `slopes` is
+        used in place of ds_k/dq if it is given.
         """
         V = self.vectors
         terms: dict[Symbol, list[Expr]] = {}
-        for slopes, force in zip(self.slopes, by_link, strict=True):
-            for q, slope in slopes.items():
+        for slopes_of_link, force in zip(slopes or self.slopes, by_link, strict=True):
+            for q, slope in slopes_of_link.items():
                 terms.setdefault(q, []).append(V.times(slope, force))
         return {q: V.add(*forces) for q, forces in terms.items()}
 
@@ -291,10 +304,15 @@ class Inertia:
 
 @dataclass
 class _Forces:
-    """Force on each link and moment about its origin, in its own frame."""
+    """Force on each link and moment about its origin, in its own frame.
+
+    parent_motion: for each link, angular velocity and acceleration of its parent, and acceleration
+    of the parent's point at the link's origin less that of gravity, in the link's frame.
+    """
 
     force: list[Vector]
     moment: list[Vector]
+    parent_motion: list[tuple[Vector, Vector, Vector]]
 
 
 class TreeDynamics:
@@ -461,6 +479,41 @@ class TreeDynamics:
         e = V.add(V.times(s, V.add(first, V.minus(second))), V.times(c, across))
         return V.times(s, e), V.times(c, e)
 
+    def matrix_to_parent(self, k: int, m: Rows, symmetric: bool = False) -> Rows:
+        """Return R m R^T, where R is the rotation from link k's frame to its parent's."""
+        V, tree = self.vectors, self.tree
+        if tree.angular[k] != 0:
+            m = self._rotate_matrix(k, m)
+        R = tree.rotation[k]
+        if all(R[i][j] == (i == j) for i in range(3) for j in range(3)):
+            return m
+        columns = list(zip(*(V.apply(R, row) for row in m), strict=True))  # columns of m R^T
+        if symmetric:
+            return symmetric_matrix(lambda i, j: V.dot(R[i], columns[j]))
+        return [[V.dot(row, column) for column in columns] for row in R]
+
+    def _rotate_matrix(self, k: int, m: Rows) -> Rows:
+        """Return R m R^T, where R is the rotation by joint k's angle."""
+        V = self.vectors
+        i, j = AXES[self.links[k].axis]
+        a = self.links[k].axis
+        out = [list(row) for row in m]
+        across = V.add(m[i][j], m[j][i])
+        t, off = self.half_turn(k, m[i][i], m[j][j], across)
+        change = V.add(off, V.minus(across))
+        out[i][i], out[j][j] = V.add(m[i][i], V.minus(t)), V.add(m[j][j], t)
+        out[i][j], out[j][i] = V.add(m[i][j], change), V.add(m[j][i], change)
+
+        def rotated(x: Expr, y: Expr) -> tuple[Expr, Expr]:
+            v = list(ZERO)
+            v[i], v[j] = x, y
+            v = list(self.tree.rotate(k, (v[0], v[1], v[2])))
+            return v[i], v[j]
+
+        out[a][i], out[a][j] = rotated(m[a][i], m[a][j])
+        out[i][a], out[j][a] = rotated(m[i][a], m[j][a])
+        return out
+
     # --- outwards: velocities, accelerations, forces ---------------------------------------------
 
     def forces(
@@ -473,7 +526,7 @@ class TreeDynamics:
         displacements. With `gravity`, the forces also support the weight of the links.
         """
         V, tree = self.vectors, self.tree
-        out = _Forces([], [])
+        out = _Forces([], [], [])
         spin = tree.angular_velocities(rates)
         alphas: list[Vector] = []
         origins: list[Vector] = []
@@ -486,6 +539,7 @@ class TreeDynamics:
                 acceleration = V.plus(acceleration, V.apply(matrices[p], r))
             alpha, acceleration = tree.from_parent(k, alpha), tree.from_parent(k, acceleration)
             parent_spin = tree.from_parent(k, spin[p]) if p >= 0 else ZERO
+            out.parent_motion.append((parent_spin, alpha, acceleration))
             alpha = V.plus(
                 alpha,
                 V.cross(parent_spin, tree.turn(k, rates[k])),

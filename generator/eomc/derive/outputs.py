@@ -158,8 +158,8 @@ def linearization(system: System, tape: Tape, accelerations: Sequence[Expr]) -> 
     """
     entries = tangent_symbols(system)
     if len(entries) * len(tape.live(accelerations)) > MAX_LINEARIZATION_SIZE:
-        return (_slopes(system, tape, accelerations, [entries])[0],)
-    columns = _slopes(system, tape, accelerations, [{x: S.One} for x in entries])
+        return (differentiate(system, tape, accelerations, [entries])[0],)
+    columns = differentiate(system, tape, accelerations, [{x: S.One} for x in entries])
     return tuple(zip(*columns, strict=True))
 
 
@@ -173,7 +173,7 @@ def directional_derivatives(system: System, tape: Tape, values: Sequence[Expr]) 
     Raises SceneError if a value contains a discontinuous function.
     """
     direction = tangent_symbols(system, parameters=system.run.by_parameters)
-    return _slopes(system, tape, values, [direction])[0]
+    return differentiate(system, tape, values, [direction])[0]
 
 
 def sensitivity(system: System, tape: Tape, accelerations: Sequence[Expr]) -> Rows:
@@ -183,7 +183,7 @@ def sensitivity(system: System, tape: Tape, accelerations: Sequence[Expr]) -> Ro
     discontinuous function.
     """
     entries = [{p.symbol: S.One} for p in system.parameters]
-    return tuple(zip(*_slopes(system, tape, accelerations, entries), strict=True))
+    return tuple(zip(*differentiate(system, tape, accelerations, entries), strict=True))
 
 
 def jacobian_products(
@@ -202,7 +202,7 @@ def jacobian_products(
     stages = dict.fromkeys(entries.values(), Stage.VELOCITY)
     tape.leaves |= stages
     tape.stage |= stages
-    (forward,) = _slopes(system, tape, accelerations, [{x: entries[x] for x in variables}])
+    (forward,) = differentiate(system, tape, accelerations, [{x: entries[x] for x in variables}])
     weights = [entries[x] for x in system.qdd]
     varying = set(variables)  # what depends on nothing else may jump
     for name in tape.live(accelerations):
@@ -214,16 +214,19 @@ def jacobian_products(
     return forward, tuple(reverse)
 
 
-def _slopes(
+def differentiate(
     system: System,
     tape: Tape,
-    accelerations: Sequence[Expr],
+    values: Sequence[Expr],
     directions: Sequence[Mapping[Symbol, Expr]],
 ) -> list[Vector]:
-    """Return the derivatives of accelerations along each of the given directions."""
+    """Return the derivatives of values along each of the given directions.
+
+    Raises SceneError if the values contain a discontinuous function.
+    """
     try:
         least = LEAST_ROOT[system.run.real]
-        return [tuple(tape.forward(accelerations, entries, least)) for entries in directions]
+        return [tuple(tape.forward(values, entries, least)) for entries in directions]
     except NotDifferentiableError:
         jump, smooth = STICKS if system.modes else JUMPS
         message = (

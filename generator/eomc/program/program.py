@@ -18,7 +18,6 @@ from eomc.derive.outputs import (
     STICKS,
     directional_derivatives,
     jacobian_products,
-    linearization,
     sensitivity,
 )
 from eomc.derive.tape import Stage, Tape
@@ -103,9 +102,8 @@ def build(derived: Derivation) -> Program:
         inertia(Program(system, functions, (), ()))
     best, taken, passed_over = accelerations(material)
     functions["acceleration"] = best
-    for function in _derivatives(system, taken):
-        functions[function.name] = replace(function, route=best.route)
     additional = (
+        *_derivatives(material, taken),
         *_constrained_functions(derived, taken),
         *_outputs(system, taken),
         *_events(system, taken),
@@ -156,16 +154,19 @@ def _solving(solution: Solution, system: System) -> Candidate:
     return Candidate(solution.tape, *values, solution.parts)
 
 
-def _derivatives(system: System, taken: Candidate) -> Iterator[Function]:
-    """Yield the derivatives of the accelerations that [run] or a method needs, by the selected
-    route.
-    """
+def _derivatives(material: RouteInputs, taken: Candidate) -> Iterator[Function]:
+    """Yield the derivatives of the accelerations that [run] or a method needs."""
+    system = material.derived.system
     run, names = system.run, system.names
     if run.needs_derivatives or any(METHODS[name].newton for name in run.methods):
-        rows = linearization(system, taken.tape, taken.outputs)
-        by_rows = len(rows) == len(system.q) and len(rows[0]) > len(rows)
-        name = "linearization" if by_rows else "linearization_column"
-        yield lower(name, taken.tape, [x for row in rows for x in row], names, checks=taken.checks)
+        candidates = {
+            r.name: derived
+            for r in ROUTES.values()
+            if (derived := r.linearization(material, taken))
+        }
+        best = cheapest("linearization", system, candidates)
+        by_columns = candidates[best.route].calls > 1
+        yield replace(best, name="linearization_column") if by_columns else best
     if run.by_parameters and system.parameters:
         rows = sensitivity(system, taken.tape, taken.outputs)
         yield lower("sensitivity", taken.tape, [x for row in rows for x in row], names)

@@ -22,11 +22,13 @@ from functools import cached_property
 from sympy import Add, Expr, Mul, Pow, Rational, S, Symbol
 
 from eomc.derive.constraints import constrained_accelerations
+from eomc.derive.energies import tangent_symbols
+from eomc.derive.inverse_dynamics_derivatives import applies, linearize
 from eomc.derive.lagrange import Derivation, EquationsOfMotion
 from eomc.derive.ldl import Rows, SolveResult, solve
 from eomc.derive.link_multipliers import prefer_short_chains
+from eomc.derive.outputs import linearization
 from eomc.derive.tape import Stage, Tape, split
-from eomc.model.symbols import ALONG
 from eomc.model.system import System
 from eomc.program.ir import Cost, Function, evaluator, nearby
 from eomc.program.lower import lower
@@ -365,6 +367,10 @@ class Route:
     functions
         Function that returns the other functions of the motion, or None if the route does not
         apply.
+    linearization
+        Function that returns the derivatives of the accelerations by q, qd and u, (nq, 2 nq + nu)
+        by rows, from the selected computation of the accelerations; None if the route does not
+        apply.
     solved
         Returns a sentence for a comment that says how D qdd = tau - bias is solved, from the system
         and the names of the coordinates in order of elimination.
@@ -376,6 +382,7 @@ class Route:
     sentence: str
     accelerations: Callable[[RouteInputs], SolveResult] = lambda _: None
     functions: Callable[[RouteInputs], RouteFunctions | None] = lambda _: None
+    linearization: Callable[[RouteInputs, Candidate], Candidate | None] = lambda *_: None
     solved: Callable[[System, str], str] = _by_ldl
     penalty: float = 1.0
 
@@ -483,6 +490,25 @@ def _by_multipliers(system: System, order: str) -> str:
     )
 
 
+def _forward(material: RouteInputs, taken: Candidate) -> Candidate:
+    """Return the derivatives of the accelerations by forward differentiation."""
+    system = material.derived.system
+    rows = linearization(system, taken.tape, taken.outputs)
+    entries = [x for row in rows for x in row]
+    columns = 2 * len(system.q) + len(system.u)
+    calls = columns * len(system.q) // len(entries)
+    return Candidate(taken.tape, entries, taken.checks, calls=calls)
+
+
+def _by_inverse_dynamics(material: RouteInputs, _: Candidate) -> Candidate | None:
+    """Return the derivatives of the accelerations from those of inverse dynamics."""
+    system, tree = material.derived.system, material.derived.system.tree
+    if tree is None or system.constraints or not applies(system, tree):
+        return None
+    derived = linearize(system, tree)
+    return Candidate(derived.tape, [x for row in derived.rows for x in row], derived.pivots)
+
+
 ROUTES: Mapping[str, Route] = {
     r.name: r
     for r in (
@@ -518,6 +544,16 @@ ROUTES: Mapping[str, Route] = {
             solved=_by_multipliers,
             penalty=1.25,  # D allows massless links, which justifies 25 % more operations
         ),
+        Route(
+            "forward",
+            "forward differentiation of the accelerations",
+            linearization=_forward,
+        ),
+        Route(
+            "tree",
+            "Newton and Euler differentiated along the tree, L D L^T",
+            linearization=_by_inverse_dynamics,
+        ),
     )
 }
 
@@ -549,6 +585,9 @@ class Candidate:
     parts
         For each constraint that is active in some contact or friction modes only: the numerator and
         the denominator of its multiplier.
+    calls
+        Number of calls of the function that give the whole result: one for each column of a matrix
+        that is given as its product with a symbolic direction.
     """
 
     tape: Tape
@@ -558,6 +597,7 @@ class Candidate:
     order: tuple[int, ...] = ()
     multipliers: Sequence[Expr] = ()
     parts: Mapping[int, Sequence[Expr]] = field(default_factory=dict)
+    calls: int = 1
 
 
 def cheapest(name: str, system: System, routes: Mapping[str, Candidate]) -> Function:
@@ -572,7 +612,8 @@ def cheapest(name: str, system: System, routes: Mapping[str, Candidate]) -> Func
     }
 
     def rank(route: str) -> tuple[float, int]:
-        return weight(lowered[route].cost) * ROUTES[route].penalty, len(lowered[route].early)
+        size = weight(lowered[route].cost) * routes[route].calls
+        return size * ROUTES[route].penalty, len(lowered[route].early)
 
     by_weight = sorted(lowered, key=rank)
     best, first = by_weight[0], next(iter(lowered))
@@ -610,7 +651,7 @@ def _errors(function: Function, system: System, states: Iterable[int]) -> list[f
     in_doubles, exact, out = evaluator(function), evaluator(function, exact=True), []
     for k in states:
         values = nearby(system, k)
-        values |= {f"{c.name}{ALONG}": 1.0 / (k + 1) for c in system.coordinates}
+        values |= {x.name: 1.0 / (k + 1) for x in tangent_symbols(system).values()}
         values |= {i.name: 0.7 + 0.1 * n for n, i in enumerate(system.inputs)}
         try:
             (computed, regular), (true, _) = in_doubles(values), exact(values)
