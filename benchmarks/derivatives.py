@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import argparse
 import resource
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -34,21 +35,15 @@ from robots import CASES, chain, robot
 
 import eomc
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from support import point_masses as point_mass_scenes
+
 
 def point_masses(links: int) -> str:
     """Return a chain of massless links between point masses, with the angles to the vertical."""
-    numbers = range(1, links + 1)
-    lines = ["eomc = 1", f'name = "points{links}"', "[coordinates]"]
-    lines += [f'q{k} = {{ unit = "rad", start = 0.1 }}' for k in numbers]
-    lines += ["[parameters]", "g = 9.81", *(f"m{k} = 1.0\nl{k} = 1.0" for k in numbers)]
-    lines += ["[definitions]"]
-    for k in numbers:
-        x, y = (f"{name}{k - 1} + " if k > 1 else "" for name in "xy")
-        lines += [f'x{k} = "{x}l{k}*sin(q{k})"', f'y{k} = "{y}-l{k}*cos(q{k})"']
-    kinetic = " + ".join(f"m{k}*(dot(x{k})**2 + dot(y{k})**2)/2" for k in numbers)
-    potential = " + ".join(f"m{k}*g*y{k}" for k in numbers)
-    lines += ["[energy]", f'kinetic = "{kinetic}"', f'potential = "{potential}"']
-    return "\n".join(lines)
+    text = point_mass_scenes.links([*range(-1, links - 1)])
+    return text.replace('name = "links"', f'name = "points{links}"')
 
 
 SCENES: dict[str, Callable[[], str]] = {
