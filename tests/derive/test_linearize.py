@@ -17,7 +17,7 @@ from eomc.model.system import from_scene
 from eomc.program import program
 from eomc.runtime.package import model_of
 from eomc.scene.read import parse
-from eomc.verify import outputs
+from eomc.verify import equations
 from eomc.verify.comparison import Comparison
 
 
@@ -292,5 +292,5 @@ def test_check_detects_a_wrong_closed_loop(modules: Modules) -> None:
     m, system = modules.unoptimised(LOOP), from_scene(parse(LOOP, "test.toml"))
     for module, passed in ((m, True), (WrongClosedLoop(), False)):
         comparison = Comparison(system, module, np.random.default_rng(0), 4)
-        results = comparison.report(outputs.closed_loop_checks)
+        results = comparison.report(equations.closed_loop_checks)
         assert [(row.name, row.passed) for row in results] == [("closed loop", passed)], results

@@ -15,7 +15,7 @@ from eomc.model.system import from_scene
 from eomc.report.equations_text import write_equations
 from eomc.scene.read import parse
 from eomc.verify import symbolic
-from eomc.verify.outputs import Formulas
+from eomc.verify.equations import Formulas
 from eomc.verify.sampling import State
 
 # names of Python, NumPy, mpmath and SymPy, and of the code that expressions compile to

@@ -15,7 +15,7 @@ import eomc
 from eomc.model.system import from_scene
 from eomc.scene.read import parse
 from eomc.verify.comparison import Comparison, Measurement
-from eomc.verify.outputs import Formulas
+from eomc.verify.equations import Formulas
 from eomc.verify.sampling import State
 
 SPACE = """eomc = 1

@@ -18,7 +18,7 @@ from eomc.cli.main import main
 from eomc.model.system import System, from_scene
 from eomc.runtime.package import model_of
 from eomc.scene.read import parse
-from eomc.verify import outputs
+from eomc.verify import equations
 from eomc.verify.comparison import Comparison
 
 SCENE = """eomc = 1
@@ -226,7 +226,7 @@ def test_check_detects_violated_limits(limited: ModuleType, perturbed: bool) -> 
     comparison = Comparison(
         from_scene(parse(BATCH, "test.toml")), module, np.random.default_rng(0), 4
     )
-    (row,) = comparison.report(outputs.limit_checks)
+    (row,) = comparison.report(equations.limit_checks)
     assert row.name == "limits of inputs" and row.passed is not perturbed, row
 
 

@@ -11,7 +11,7 @@ from support.session import Modules
 
 from eomc.model.system import System, from_scene, symbol
 from eomc.scene.read import parse
-from eomc.verify import outputs, runs
+from eomc.verify import equations, runs
 from eomc.verify.check import check
 from eomc.verify.comparison import Comparison
 
@@ -102,7 +102,7 @@ tolerance = 1e-9
 def test_complex_values_of_formulas_are_not_compared(modules: Modules) -> None:
     system = from_scene(parse(ODD))
     comparison = Comparison(system, modules.unoptimised(system), np.random.default_rng(0), 8)
-    tables = (runs.event_function_checks, outputs.checks)
+    tables = (runs.event_function_checks, equations.output_and_limit_checks)
     results = [row for table in tables for row in comparison.report(table)]
     assert {"events", "jumps", "outputs"} <= {row.name for row in results}
     assert all(row.passed for row in results)

@@ -12,7 +12,7 @@ from support.session import Modules
 from eomc.mechanism.assembly import assembled
 from eomc.model.system import from_scene
 from eomc.scene.read import parse
-from eomc.verify import outputs
+from eomc.verify import equations
 from eomc.verify.comparison import Comparison
 
 SCENE = """eomc = 1
@@ -67,7 +67,7 @@ class Wrong:
 def test_wrong_outputs_fail(modules: Modules, wrong: dict[str, float], failed: list[str]) -> None:
     system, module = from_scene(parse(SCENE, "test.toml")), modules.unoptimised(SCENE)
     comparison = Comparison(system, Wrong(module, **wrong), np.random.default_rng(0), None)
-    results = comparison.report(outputs.output_checks)
+    results = comparison.report(equations.output_checks)
     assert [row.name for row in results] == ["outputs", "outputs: C, D"]
     assert [row.name for row in results if not row.passed] == failed, results
 
@@ -111,7 +111,7 @@ def test_wrong_outputs_of_multipliers_fail(
         modules.unoptimised(ON_A_ROD),
     )
     comparison = Comparison(system, Wrong(module, **wrong), np.random.default_rng(0), None)
-    results = comparison.report(outputs.output_checks)
+    results = comparison.report(equations.output_checks)
     assert [row.name for row in results if not row.passed] == failed, results
 
 
@@ -124,7 +124,7 @@ def test_derivatives_by_parameters_that_jumps_change(modules: Modules) -> None:
     text += '[[event]]\nname = "sheds"\nwhen = "t - 1"\naction = "jump"\nm = "m/2"\n'
     system, module = assembled(from_scene(parse(text, "test.toml"))), modules.unoptimised(text)
     comparison = Comparison(system, module, np.random.default_rng(0), None)
-    results = comparison.report(outputs.output_checks)
+    results = comparison.report(equations.output_checks)
     assert [row.passed for row in results] == [True, True], results
 
 
@@ -149,7 +149,7 @@ load = "k*x + x_ddot"
 def test_output_that_cancels_with_an_acceleration_passes(modules: Modules) -> None:
     system, module = from_scene(parse(CANCELLING, "test.toml")), modules.unoptimised(CANCELLING)
     comparison = Comparison(system, module, np.random.default_rng(0), None)
-    results = comparison.report(outputs.output_checks)
+    results = comparison.report(equations.output_checks)
     assert {row.name: row.passed for row in results} == {"outputs": True}
 
 
@@ -159,7 +159,7 @@ def test_wrong_derivatives_by_parameters_fail(modules: Modules, wrong: dict[str,
     text += '[run]\nlinearize = "parameters"\n'
     system, module = from_scene(parse(text, "test.toml")), modules.unoptimised(text)
     comparison = Comparison(system, Wrong(module, **wrong), np.random.default_rng(0), None)
-    results = comparison.report(outputs.output_checks)
+    results = comparison.report(equations.output_checks)
     assert {row.name: row.passed for row in results} == {
         "outputs": True,
         "outputs: C, D": True,

@@ -13,14 +13,7 @@ import numpy as np
 
 from eomc.model.system import System
 from eomc.runtime.package import model_of
-from eomc.verify import (
-    bodies,
-    constraints,
-    convergence,
-    equations,
-    outputs,
-    runs,
-)
+from eomc.verify import bodies, constraints, convergence, equations, runs
 from eomc.verify.comparison import Check, CheckReport, Comparison
 
 Table = Callable[[Comparison], Iterable[Check]]
@@ -32,7 +25,7 @@ TABLES: tuple[Table, ...] = (
     equations.derivative_checks,
     constraints.checks,
     bodies.checks,
-    outputs.checks,
+    equations.output_and_limit_checks,
 )
 
 

@@ -29,7 +29,7 @@ from eomc.model.symbols import Output
 from eomc.runtime.package import model_of
 from eomc.verify import reference
 from eomc.verify.comparison import LIMIT, Check, Comparison
-from eomc.verify.outputs import Formulas, output_error
+from eomc.verify.equations import Formulas, output_error
 from eomc.verify.reference import Vector
 from eomc.verify.sampling import (
     MAX_DISTANCE,
