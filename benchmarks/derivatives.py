@@ -3,13 +3,16 @@
     python benchmarks/derivatives.py                       # every scene
     python benchmarks/derivatives.py chain8 ur10 --states 500 2000 --rounds 9
 
-Scenes: points, chains of point masses, whose accelerations take link multipliers; chain, of rods;
-robots. Prints for each scene and number of states a call:
+Scenes: a cart-pole; points, chains of point masses, whose accelerations take link multipliers;
+chain, of rods; robots. Prints for each scene and number of states a call:
 
 - acc: time of `acceleration` a state, ns;
 - linearize: `linearize`, in accelerations;
 - vjp, jvp: `acceleration_vjp` and `acceleration_jvp`, in accelerations, parameters included;
 - RK4: `discretize` by RK4, in accelerations and in `linearize`;
+- gradient: `run.vjp`, the gradient of a function of the rows of a run of 1,000 steps by RK4 with
+  respect to start, inputs and parameters, in runs; then its relative difference from differences
+  of runs along one direction (of order 8, in doubles);
 - faults: page faults a state of `linearize`; the allocator then returns memory after each call;
 - error: the largest difference of A and B from differences of the accelerations (of order 8, in
   doubles, accurate to some 1e-10), relative to the largest entry.
@@ -34,6 +37,7 @@ import numpy as np
 from robots import CASES, chain, robot
 
 import eomc
+from eomc.base import resources
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
@@ -47,6 +51,7 @@ def point_masses(links: int) -> str:
 
 
 SCENES: dict[str, Callable[[], str]] = {
+    "cartpole": lambda: resources.scenes()["cartpole"].read_text(encoding="utf-8"),
     **{f"points{n}": partial(point_masses, n) for n in (5, 8, 12)},
     **{f"chain{n}": partial(chain, n) for n in (5, 8, 12)},
     "ur10": partial(robot, "ur_description/urdf/ur10_robot.urdf"),
@@ -103,6 +108,31 @@ def difference_error(m: Any, q: Any, qd: Any, u: Any, width: float = 4e-3) -> fl
     return float(max(errors))
 
 
+def gradient(m: Any, rounds: int) -> str:
+    """Return the time of the gradient of a run, in runs, and its relative error."""
+    random, steps = np.random.default_rng(2), 1000
+    q, qd, dq, dqd, w = random.uniform(-0.5, 0.5, (5, m.nq))
+    u, du = random.uniform(-1, 1, (2, steps, m.nu))
+
+    def simulate(x: float = 0.0) -> Any:
+        inputs = u + x * du if m.nu else None
+        return m.simulate(q + x * dq, qd + x * dqd, h=1e-4, steps=steps, u=inputs)
+
+    run = simulate()
+    q_bar, qd_bar = np.tile(w, (2, steps + 1, 1))
+    pull_back = partial(run.vjp, q_bar, qd_bar)
+    times, bars = shortest({"run": simulate, "vjp": pull_back}, rounds), pull_back()
+    exact = bars.q @ dq + bars.qd @ dqd + (np.sum(bars.u * du) if m.nu else 0.0)
+
+    def loss(x: float) -> float:
+        states = simulate(x)
+        return float(np.sum(w * states.q) + np.sum(w * states.qd))
+
+    width = 1e-3
+    near = sum(c * (loss(k * width) - loss(-k * width)) for k, c in STENCIL) / width
+    return f"{times['vjp'] / times['run']:.1f}, {abs(exact / near - 1):.0e}"
+
+
 def rows(name: str, m: Any, states: list[int], rounds: int) -> None:
     """Print the rows of a scene."""
     random = np.random.default_rng(1)
@@ -125,7 +155,7 @@ def rows(name: str, m: Any, states: list[int], rounds: int) -> None:
             f"| {name} | {count} | {one / count * 1e9:.0f} ns | {ratios['linearize']} "
             f"| {ratios['vjp']} | {ratios['jvp']} "
             f"| {ratios['discretize']} = "
-            f"{times['discretize'] / linear:.1f} linearize "
+            f"{times['discretize'] / linear:.1f} linearize | {gradient(m, rounds)} "
             f"| {faults:.2f} | {difference_error(m, q, qd, u):.0e} |",
             flush=True,
         )
@@ -137,8 +167,8 @@ def main() -> None:
     parser.add_argument("--states", type=int, nargs="+", default=[500, 2000])
     parser.add_argument("--rounds", type=int, default=9)
     options = parser.parse_args()
-    print("| scene | states | acc | linearize | vjp | jvp | RK4 | faults | error |")
-    print("|---|---|---|---|---|---|---|---|---|", flush=True)
+    print("| scene | states | acc | linearize | vjp | jvp | RK4 | gradient | faults | error |")
+    print("|---|---|---|---|---|---|---|---|---|---|", flush=True)
     for name in options.names or SCENES:
         with tempfile.TemporaryDirectory() as folder:
             rows(name, load(name, Path(folder)), options.states, options.rounds)

@@ -146,6 +146,8 @@ CASES = {
     "input of gauss6": derivative("gauss6", "INPUTS", "NEWTON"),
     "derivative of rk4 with constraints": derivative("rk4", "CONSTRAINTS"),
     "derivative of gauss6 with constraints": derivative("gauss6", "CONSTRAINTS", "NEWTON"),
+    "adjoint of rk4": Case("test_adjoint.c", METHODS["rk4"]),
+    "adjoint of dp8 with inputs": Case("test_adjoint.c", METHODS["dp8"], ("INPUTS", "PARAMETERS")),
     "adaptive": Case("test_adaptive.c", None, ("ADAPTIVE",)),
     "kinks": Case("test_adaptive.c", None, ("ADAPTIVE", "KINKS")),
     "constraints": Case("test_adaptive.c", None, ("ADAPTIVE", "CONSTRAINTS")),
@@ -165,8 +167,8 @@ def check_program(call: Sequence[str], words: Sequence[str], folder: Path) -> No
 # Each C file, and each integration method once
 QUICK = (
     "linear", "rk4", "dp8", "euler", "verlet", "gauss4", "gauss6 with constraints", "gauss8",
-    "gauss16 with constraints", "projection", "derivative of gauss6 with constraints", "kinks",
-    "events",
+    "gauss16 with constraints", "adjoint of dp8 with inputs", "projection",
+    "derivative of gauss6 with constraints", "kinks", "events",
 )  # fmt: skip
 
 

@@ -226,7 +226,7 @@ action = "jump"
 y_dot = "-e*y_dot"
 [run]
 tolerance = 1e-9
-linearize = true
+linearize = "products"
 discretize = true
 """
 

@@ -197,21 +197,54 @@ def jacobian_products(
     the second by a reverse sweep (Griewank & Walther, ch. 3). Raises SceneError if the
     accelerations contain a discontinuous function.
     """
-    variables = (*system.q, *system.qd, *system.u, *(p.symbol for p in system.parameters))
-    entries = {x: symbol(f"{x.name}{ALONG}") for x in (*variables, *system.qdd)}
-    stages = dict.fromkeys(entries.values(), Stage.VELOCITY)
+    variables = _variables(system)
+    direction = _vector_symbols(tape, variables)
+    along = dict(zip(variables, direction, strict=True))
+    (forward,) = differentiate(system, tape, accelerations, [along])
+    return forward, _pull_back(system, tape, accelerations, system.qdd)
+
+
+def signal_vjp(system: System) -> tuple[Tape, Vector]:
+    """Return the product w^T J of the Jacobian J = du/d[q, qd, u, p] of the scene's signals u.
+
+    The components of w are the symbols of the inputs with the suffix `ALONG`. The derivatives with
+    respect to u are 0. Raises NotDifferentiableError if a signal contains a discontinuous function.
+    """
+    signals = tuple(Output(i.name, i.signal) for i in system.inputs)
+    derived = outputs(replace(system, outputs=signals, inputs=()), with_derivatives=False)
+    return derived.tape, _pull_back(system, derived.tape, derived.values, system.u)
+
+
+def _variables(system: System) -> tuple[Symbol, ...]:
+    """Return the symbols of q, qd, u and the parameters."""
+    return (*system.q, *system.qd, *system.u, *(p.symbol for p in system.parameters))
+
+
+def _vector_symbols(tape: Tape, names: Sequence[Symbol]) -> list[Symbol]:
+    """Return the symbols of a vector with an entry for each name, as leaves of the tape."""
+    entries = [symbol(f"{x.name}{ALONG}") for x in names]
+    stages = dict.fromkeys(entries, Stage.VELOCITY)
     tape.leaves |= stages
     tape.stage |= stages
-    (forward,) = differentiate(system, tape, accelerations, [{x: entries[x] for x in variables}])
-    weights = [entries[x] for x in system.qdd]
+    return entries
+
+
+def _pull_back(
+    system: System, tape: Tape, values: Sequence[Expr], names: Sequence[Symbol]
+) -> Vector:
+    """Return the gradient of the sum of values times the entries of a vector, see _vector_symbols.
+
+    The gradient is with respect to [q, qd, u, p].
+    """
+    variables = _variables(system)
+    pairs = list(zip(values, _vector_symbols(tape, names), strict=True))
     varying = set(variables)  # what depends on nothing else may jump
-    for name in tape.live(accelerations):
+    for name in tape.live(values):
         varying |= {name} if varying.intersection(tape.parts[name]) else set()
     saved, tape.constant_leaves = tape.constant_leaves, frozenset(tape.stage.keys() - varying)
-    pairs = list(zip(accelerations, weights, strict=True))
-    reverse = tape.gradient(pairs, variables, least=LEAST_ROOT[system.run.real])
+    gradient = tape.gradient(pairs, variables, least=LEAST_ROOT[system.run.real])
     tape.constant_leaves = saved
-    return forward, tuple(reverse)
+    return tuple(gradient)
 
 
 def differentiate(

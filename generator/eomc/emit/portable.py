@@ -29,7 +29,7 @@ def files(
     texts = [*solver.projected_step_source(model), *solver.state_source(model)]
     for m in functions.methods:
         texts += [*(solver.step_source(model, m) if m is not RK4 else ()), step(model, m)]
-    texts += [*step_derivatives(model), *_runs(model)]
+    texts += [*step_derivatives(model), *solver.run_adjoints(model), *_runs(model)]
     corrections = [f.text for f in (functions.projection, functions.rate_terms) if f]
     texts[:0] = [*corrections, *functions.constraint_texts, *model.source(texts)]
     steps = list(dict.fromkeys(text.rstrip("\n") for text in texts))  # methods share definitions

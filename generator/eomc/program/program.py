@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 from sympy import Add, Expr, S, Symbol, expand
@@ -19,8 +20,9 @@ from eomc.derive.outputs import (
     directional_derivatives,
     jacobian_products,
     sensitivity,
+    signal_vjp,
 )
-from eomc.derive.tape import Stage, Tape
+from eomc.derive.tape import NotDifferentiableError, Stage, Tape
 from eomc.integrators.tableaux import METHODS
 from eomc.model.symbols import ALONG, Output, dot, needed_definitions, symbol
 from eomc.model.system import System, t
@@ -174,6 +176,10 @@ def _derivatives(material: RouteInputs, taken: Candidate) -> Iterator[Function]:
         products = jacobian_products(system, taken.tape, taken.outputs)
         for name, values in zip(("acceleration_jvp", "acceleration_vjp"), products, strict=True):
             yield lower(name, taken.tape, values, names, checks=taken.checks)
+    if run.linearize == "products" and system.inputs:
+        with suppress(NotDifferentiableError):
+            tape, values = signal_vjp(system)
+            yield lower("signal_vjp", tape, values, names)
 
 
 def _outputs(system: System, taken: Candidate) -> Iterator[Function]:

@@ -21,6 +21,7 @@ from .saved import NOT_STORED
 from .status import STATUS_MESSAGES, Interrupted, MotionError, state_text
 
 if TYPE_CHECKING:
+    from .adjoint import RunGradient
     from .balance import Balance
     from .sensitivity import Sensitivity
 
@@ -313,6 +314,47 @@ class Trajectory(Columns):
             f"{many} where a constraint depends on others, first at t = {self.first_singular:.9g}: "
             "multipliers and reactions are not unique there"
         )
+
+    def vjp(self, q_bar: ArrayLike | None, qd_bar: ArrayLike | None = None) -> RunGradient:
+        """Return the gradient of a scalar function of the rows: start, inputs and parameters.
+
+        The gradient is that of the steps themselves (discrete adjoint), exact to rounding, at the
+        cost of a few runs, whatever the number of inputs and parameters. Memory is bounded: the
+        steps between two rows are made again in parts.
+
+        Parameters
+        ----------
+        q_bar, qd_bar : (n, nq) array_like or None
+            Derivatives of the function with respect to the positions and velocities at the rows;
+            None: zeros.
+
+        Returns
+        -------
+        RunGradient
+            Derivatives q, qd (nq,) with respect to the start, u with respect to the inputs, in
+            their shape, and p (np,) with respect to the parameters at a constant start.
+
+        Raises
+        ------
+        MotionError
+            If a derivative is not finite.
+        ValueError
+            If the module was built without Jacobian products, or if the run has no adjoint: that
+            of adaptive steps, of an implicit method, with rows at requested times, with constraints
+            or with events that occurred.
+
+        Notes
+        -----
+        Values of a function u count as a table: its dependence on the state is not included.
+
+        References
+        ----------
+        W. W. Hager, Runge-Kutta methods in optimal control and the transformed adjoint system,
+        Numer. Math. 87 (2000), 247-282.
+        """
+        from .adjoint import pull_back
+
+        return pull_back(self, self._replayed_request(), q_bar, qd_bar)
 
     def balance(self) -> Balance | None:
         """Return the energy balance of the run, J, with the numerical error that follows from it.

@@ -254,7 +254,7 @@ def derivative_checks(comparison: Comparison) -> Iterator[Check]:
                 name, partial(acceleration_error, name), tolerance=limit, states=states, unit=UNIT,
                 portable=True, why="no state has finite differences",
             )  # fmt: skip
-    if run.discretize and comparison.compiled:
+    if (run.discretize or run.linearize == "products") and comparison.compiled:
         yield from step_derivative_checks(comparison)
 
 
@@ -330,7 +330,7 @@ def rounding_growth(of: Comparison, name: str, e: Expected, derivatives: Vector)
 
 
 def step_derivative_checks(comparison: Comparison) -> Iterator[Check]:
-    """Yield the checks of `discretize`, which linearises one step, one for each method."""
+    """Yield the checks of `discretize` and of the adjoint of a run of one step, by each method."""
 
     @cache
     def exact(method: str, k: int, h: float) -> list[Vector]:
@@ -338,17 +338,24 @@ def step_derivative_checks(comparison: Comparison) -> Iterator[Check]:
         with np.errstate(all="ignore"):
             return [_step_differences(comparison, method, s, h, width * scales) for width in WIDTHS]
 
-    states = [e.state for e in comparison.few(4)]
+    states, run = [e.state for e in comparison.few(4)], comparison.system.run
+    adjoint = run.linearize == "products" and not comparison.system.constraints
     for method in comparison.methods:
+        required = {
+            "discretize": run.discretize, "adjoint": adjoint and not METHODS[method].implicit
+        }  # fmt: skip
+        for name in (name for name, is_required in required.items() if is_required):
 
-        def error(of: Comparison, k: int, method: str = method) -> float | None:
-            return _step_error(of, method, states[k], partial(exact, method, k))
+            def error(
+                of: Comparison, k: int, method: str = method, name: str = name
+            ) -> float | None:
+                return _step_error(of, name, method, states[k], partial(exact, method, k))
 
-        yield Check(
-            f"discretize by {method}", error, tolerance=max(SLOPE_LIMIT, LIMIT * comparison.eps),
-            states=range(len(states)), unit=UNIT, portable=True,
-            why="no state has finite differences",
-        )  # fmt: skip
+            yield Check(
+                f"{name} by {method}", error, tolerance=max(SLOPE_LIMIT, LIMIT * comparison.eps),
+                states=range(len(states)), unit=UNIT, portable=True,
+                why="no state has finite differences",
+            )  # fmt: skip
 
 
 def _has_parameters(of: Comparison) -> bool:
@@ -370,12 +377,32 @@ def _variable_scales(of: Comparison, s: State) -> Vector:
     )
 
 
+def _step_derivatives(of: Comparison, name: str, method: str, s: State, h: float) -> list[Vector]:
+    """Return the module's derivatives of a step's end by [q, q̇], by u and by p.
+
+    name: "discretize", or "adjoint" for one adjoint of a run of one step for each row.
+    """
+    if name == "adjoint":
+        run = of.simulate(s, method, h=h, steps=1, t0=s.t)
+        units = np.eye(2 * len(s.q)).reshape(-1, 2, len(s.q))  # derivatives by q and qd at the end
+        rows = [run.vjp(*([0 * x, x] for x in unit)) for unit in units]
+        return [
+            np.array([np.hstack([row.q, row.qd]) for row in rows], float),
+            np.array([row.u.ravel() for row in rows], float),
+            *([np.array([row.p for row in rows], float)] if of.system.parameters else []),
+        ]
+    arguments = {"h": h, "t": s.t, "u": s.u, "params": s.params, "method": method}
+    if _has_parameters(of):
+        arguments["parameters"] = True
+    return [np.asarray(x, float) for x in of.module.discretize(s.q, s.qd, **arguments)]
+
+
 def _step_error(
-    of: Comparison, method: str, s: State, exact: Callable[[float], list[Vector]]
+    of: Comparison, name: str, method: str, s: State, exact: Callable[[float], list[Vector]]
 ) -> float | None:
     """Return the largest error at a state, the best of some widths for each entry.
 
-    None if there are no finite differences.
+    name: as in `_step_derivatives`. None if there are no finite differences.
     """
     n, scales = len(s.q), _variable_scales(of, s)
     # shorter steps if the iteration for the stages of an implicit method does not converge
@@ -383,10 +410,7 @@ def _step_error(
         near = exact(h)
         if not any(np.isfinite(J).all() for J in near) or _moves_far(of, method, s, h):
             continue
-        arguments = {"h": h, "t": s.t, "u": s.u, "params": s.params, "method": method}
-        if _has_parameters(of):
-            arguments["parameters"] = True
-        derivatives = [np.asarray(x, float) for x in of.module.discretize(s.q, s.qd, **arguments)]
+        derivatives = _step_derivatives(of, name, method, s, h)
         # inputs may change a coordinate by 1e-4 of its scale in a step; less is not judged
         ends, size = np.cumsum([x.shape[1] for x in derivatives]), 1e-4 * scales[: 2 * n]
         parts = [slice(end - x.shape[1], end) for end, x in zip(ends, derivatives, strict=True)]

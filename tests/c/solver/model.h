@@ -59,6 +59,7 @@ typedef struct {
     real restitution; /* of the ball's impacts at q[0] = 0 */
     real (*mark)(real q); /* event function of q[0]; NULL: that of the oscillator, q[1] */
     real stop; /* time at which a run stops; 0: none */
+    const real *u; /* of the coupled pendulums: an additional acceleration of the first; NULL: none */
 } eom_model;
 
 typedef struct {
@@ -96,7 +97,7 @@ static eom_status eom_accelerate(real *qdd, const real *q, const real *qd, real 
             qdd[i] = -m->k*q[i] - m->c*qd[i];
         break;
     case COUPLED:
-        qdd[0] = -SIN(q[0]) + (q[1] - q[0])/2 - m->c*qd[0]*COS(q[1]) + COS(2*t)/4;
+        qdd[0] = -SIN(q[0]) + (q[1] - q[0])/2 - m->c*qd[0]*COS(q[1]) + COS(2*t)/4 + (m->u ? *m->u : 0);
         qdd[1] = -2*SIN(q[1]) + (q[0] - q[1])/2 - m->c*(qd[1] - qd[0]);
         break;
     case POLYNOMIAL:

@@ -7,6 +7,9 @@
 #include "linear.c"
 #include "differences.c"
 #endif
+#define eom_method_c eom_gauss_c
+#define eom_method_A eom_gauss_A
+#define eom_method_AA eom_gauss_AA
 #define eom_method_b eom_gauss_b
 #define eom_method_bA eom_gauss_bA
 #include "step_end.c"

@@ -15,6 +15,7 @@ from eomc.emit.common.c_function import (
     return_statement,
 )
 from eomc.emit.common.c_names import Target
+from eomc.integrators.tableaux import Method
 from eomc.program.ir import Function
 from eomc.program.program import TIME
 
@@ -131,6 +132,9 @@ KINDS: Mapping[str, Kind] = {
         "Derivatives [du/dq, du/dqd] of the scene's signals u, by rows."),
     "signal_sensitivity": Kind("slopes", "m*p", "qd",
         "Derivatives du/dp of the scene's signals u, by rows, columns for parameters."),
+    "signal_vjp": Kind("bar", "x", "qd along",
+        "bar = J^T w, with the derivatives J of the scene's signals by [q, qd, u, p] and the "
+        "entries w of `along` for u, in the same order."),
     "signal": Kind("u", "m", "qd", "Signals of the scene for the inputs u."),
 }  # fmt: skip
 _PLANE = {
@@ -374,6 +378,30 @@ class Public:
         return self._status(
             f"{method}_derivative", *out, *self.arguments(*STATE, "t", "h", "u", "p")
         )
+
+    def has_adjoint(self, method: Method) -> bool:
+        """Return True if there is a function for the adjoint of runs by a method."""
+        constrained = bool(self.target.system.constraints)
+        return self.has("acceleration_vjp") and not (method.implicit or constrained)
+
+    def adjoint(self, method: str) -> CFunction:
+        """Return the prototype of the C function for the adjoint of runs by a method.
+
+        It computes the derivatives of a function of the rows of a run with respect to its start,
+        inputs and parameters.
+        """
+        target, real = self.target, self.target.real.name
+        bars = [output_array(real, name, f"{target.PREFIX}_NQ") for name in ("q_bar", "qd_bar")]
+        bars += [output_array(real, "u_bar")] if target.system.inputs else []
+        count = len(target.system.parameters)
+        bars += [output_array(real, "p_bar", str(count))] if count else []
+        rows = (input_array(real, name) for name in ("q_rows", "qd_rows", "q_bars", "qd_bars"))
+        numbers = (CArgument("long", name) for name in ("steps", "every"))
+        hold = [CArgument("long", "hold")] if target.system.inputs else []
+        return self._status(
+            f"{method}_adjoint", *bars, *rows, *self.arguments("t", "h"), *numbers,
+            *self.arguments("u"), *hold, *self.arguments("p"), output_array(real, "work"),
+        )  # fmt: skip
 
     @property
     def integrate(self) -> CFunction:

@@ -32,7 +32,7 @@ from eomc.emit.common.c_function import (
 )
 from eomc.emit.common.c_names import Target
 from eomc.emit.common.functions import SceneFunctions
-from eomc.emit.common.public import program_function
+from eomc.emit.common.public import c_array_size, program_function
 from eomc.emit.common.templates import show
 from eomc.integrators.tableaux import Method, Row
 
@@ -105,6 +105,8 @@ STEP_FILES = {
 }
 LIBM = ("atan", "fabs", "floor", "fmax", "sqrt")  # functions of the C mathematics library
 ACCELERATE = "qdd = the accelerations at the state q, qd and time t."
+ACCELERATION_VJP = "bar = the derivatives of the accelerations' sum with the weights qdd_bar."
+SIGNAL_VJP = "bar = the derivatives of the signals' sum with weights, the entries of `along` for u."
 CALL_STEP = "Advance q and qd by a step of size h of a method for fixed steps."
 CORRECTION = "d = the corrections of q and qd onto the constraints, and the inverse pivots."
 CORRECTION_ALONG = "The correction of the state q, qd, and its derivatives along a direction."
@@ -317,7 +319,7 @@ def public_callbacks(functions: SceneFunctions, model: SolverModel) -> list[CFun
         prototype = c.static_prototype(f"{prefix}_call_step", functions.status, *arguments)
         body = (Block("", lines),)
         callbacks.append(replace(prototype, body=body, reads=reads, doc=(CALL_STEP,)))
-    if functions.target.system.run.discretize:
+    if functions.target.system.run.discretize or public.has("acceleration_vjp"):
         callbacks += derivative_callbacks(functions, model)
     return callbacks
 
@@ -342,6 +344,14 @@ def derivative_callbacks(functions: SceneFunctions, model: SolverModel) -> Itera
     for name, callee, doc, first in wrapped:
         arguments = (*first, *state)
         yield callback(f"{prefix}_evaluate_{name}", callee, arguments, doc, **passed)
+    bar, weights = c.output_array(real, "bar"), c.input_array(real, "qdd_bar")
+    if public.has("acceleration_vjp"):
+        callee, name = public.evaluation("acceleration_vjp"), f"{prefix}_evaluate_acceleration_vjp"
+        arguments = (bar, q, qd, weights, t, *model.argument)
+        yield callback(name, callee, arguments, ACCELERATION_VJP, **passed)
+    if public.has("signal_vjp"):
+        callee, name = public.evaluation("signal_vjp"), f"{prefix}_evaluate_signal_vjp"
+        yield callback(name, callee, (bar, along, *state), SIGNAL_VJP, **passed)
     moved = (c.output_array(real, "q"), c.output_array(real, "qd"), t, CArgument(real, "h"))
     for method in functions.methods:
         name, doc = f"{prefix}_{method.name}_make_step", f"Make a step of {method.title}."
@@ -487,6 +497,31 @@ def step_derivatives(model: SolverModel) -> Iterator[str]:
             tableau_tables(functions, method),
         )
         yield _derivative(model, method, width)
+
+
+def run_adjoints(model: SolverModel) -> Iterator[str]:
+    """Yield C definitions of the adjoint of runs by each method that has one."""
+    functions, target = model.functions, model.functions.target
+    features = {
+        "INPUTS": bool(target.system.inputs),
+        "FEEDBACK": functions.public.has("signal_vjp"),
+        "PARAMETERS": bool(target.system.parameters),
+        "CONSTRAINTS": False,
+    }
+    exact = {
+        "EOM_VARIABLES": c_array_size(target, "x"),
+        "EOM_PARAMETERS": str(len(target.system.parameters)),
+    }
+    for method in filter(functions.public.has_adjoint, functions.methods):
+        tables = (f"eom_explicit_{name}" for name in ("c", "A", "AA", "b", "bA"))
+        yield from amalgamate(
+            ("state.c", "step_end.c", "adjoint.c"),
+            ["eom_method_pull_back_run", *tables],
+            library_names(model, method, **exact),
+            features,
+            tableau_tables(functions, method),
+        )
+        yield show("c/adjoint.c", functions, method=method, model=model)
 
 
 def _derivative(model: SolverModel, method: Method, width: str) -> str:

@@ -543,7 +543,7 @@ def _from_library(steppers: Steppers, model: SolverModel) -> Iterator[str]:
     side_by_side = run.batch and integrates and adaptive.steps_in_parallel(functions.target)
     if integrates:
         texts += adaptive.library_texts(model, LANE_ROOTS if side_by_side else ())
-    texts += step_derivatives(model)
+    texts += [*step_derivatives(model), *solver.run_adjoints(model)]
     if texts:
         own = (*functions.constraint_texts, *model.source(texts), *dict.fromkeys(texts))
         yield from (text.rstrip("\n") + "\n" for text in own)
@@ -594,10 +594,11 @@ def library_model(steppers: Steppers) -> SolverModel:
     """
     functions, one, m = steppers.functions, steppers.one, adaptive.METHOD
     real, prefix, system = functions.real, functions.prefix, functions.target.system
-    integrates = functions.target.integrates
-    members = [a for a in steppers.step_arguments(one) if a.name in "ucp" and integrates]
+    products = functions.public.has("acceleration_vjp")
+    accelerates = functions.target.integrates or products
+    members = [a for a in steppers.step_arguments(one) if a.name in "ucp" and accelerates]
     present = {a.name for a in members}
-    if system.events or system.constraints or system.run.discretize:
+    if system.events or system.constraints or system.run.discretize or products:
         members += [a for a in functions.public.arguments("u", "p") if a.name not in present]
     bare = SolverModel(functions, tuple(members), (), one.c_width)
     passed = bare.arguments

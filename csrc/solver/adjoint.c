@@ -1,0 +1,208 @@
+/*
+ * The discrete adjoint of a run with fixed steps of an explicit Runge-Kutta method: the derivatives of a function of
+ * its rows with respect to its start, inputs and parameters, step by step backwards (Hager, Numer. Math. 87 (2000),
+ * 247). The name x_bar stands for the derivative of that function with respect to x.
+ */
+
+/* A run with fixed steps: n-th step from t0 + n h, with row n/hold of the table u of inputs. */
+typedef struct {
+    real t0, h;
+    long steps, every; /* there is a row after each `every` steps, and after the last step */
+#if EOM_INPUTS
+    const real *u; /* NULL: the scene's signals, at each stage */
+    long hold;
+#endif
+} eom_adjoint_run;
+
+/* Derivatives with respect to the present state, to the inputs of each row of the table, and to the parameters. */
+typedef struct {
+    real *q, *qd;
+#if EOM_INPUTS
+    real *u;
+#endif
+#if EOM_PARAMETERS
+    real *p;
+#endif
+} eom_adjoint_sums;
+
+/*
+ * Record n steps, from the state at the beginning of the first record on. A record has the start q, qd of a step and the
+ * accelerations at its stages. The state after the steps follows the last record. first: number of the first step.
+ */
+static eom_status eom_method_record_steps(real *records, long first, long n, const eom_adjoint_run *run, const eom_model *m)
+{
+    enum { NQ = EOM_NQ, S = EOM_METHOD_STAGES, RECORD = (2 + S)*NQ };
+#if EOM_INPUTS
+    eom_model own = *m;
+#endif
+
+    for (long k = 0; k < n; k++) {
+        real *const q = records + RECORD*k, *const qd = q + NQ, *const a = qd + NQ, *const next = a + S*NQ;
+        const real t = run->t0 + (real)(first + k)*run->h;
+        real r[EOM_WIDTH], v[EOM_WIDTH], qdd[EOM_WIDTH] = { 0 };
+
+#if EOM_INPUTS
+        own.u = run->u ? run->u + EOM_NU*((first + k)/run->hold) : run->u;
+        m = &own;
+#endif
+        for (int i = 0; i < S; i++) {
+            eom_status status;
+
+            eom_method_stage_state(r, v, a, i, i, q, qd, run->h);
+            status = eom_accelerate(qdd, r, v, t + eom_method_c[i]*run->h, m);
+            if (status)
+                return status;
+            for (int l = 0; l < NQ; l++)
+                a[NQ*i + l] = qdd[l];
+        }
+        eom_method_end_state(next, next + NQ, a, q, qd, run->h);
+    }
+    return EOM_OK;
+}
+
+/* bar = the derivatives by [q, qd, u, p] of the sum of the accelerations times qdd_bar. */
+static eom_status eom_pull_back_accelerations(real *bar, const real *qdd_bar, const real *q, const real *qd, real t, const eom_model *m)
+{
+    const eom_status status = eom_evaluate_acceleration_vjp(bar, q, qd, qdd_bar, t, m);
+#if EOM_FEEDBACK
+    real of_signals[EOM_VARIABLES];
+
+    if (status == EOM_OK && !m->u) {
+        eom_evaluate_signal_vjp(of_signals, bar, q, qd, t, m);
+        for (int k = 0; k < EOM_VARIABLES; k++)
+            bar[k] += of_signals[k];
+    }
+#endif
+    return status;
+}
+
+/* Replace the derivatives with respect to the end of a recorded step by those with respect to its start. */
+static eom_status eom_method_pull_back_step(const eom_adjoint_sums *to, const real *record, real t, real h, const eom_model *m)
+{
+    enum { NQ = EOM_NQ, S = EOM_METHOD_STAGES };
+    const real *const q = record, *const qd = q + NQ, *const a = qd + NQ;
+    real a_bar[S*NQ], bar[EOM_VARIABLES], r[NQ], v[NQ];
+
+    for (int k = 0; k < NQ; k++) {
+        for (int i = 0; i < S; i++)
+            a_bar[NQ*i + k] = h*(h*eom_method_bA[i]*to->q[k] + eom_method_b[i]*to->qd[k]);
+        to->qd[k] += h*to->q[k];
+    }
+    for (int i = S - 1; i >= 0; i--) {
+        const real c = eom_method_c[i], *const A = eom_method_A[i], *const AA = eom_method_AA[i];
+        eom_status status;
+
+        eom_method_stage_state(r, v, a, i, i, q, qd, h);
+        status = eom_pull_back_accelerations(bar, a_bar + NQ*i, r, v, t + c*h, m);
+        if (status)
+            return status;
+        for (int k = 0; k < NQ; k++) {
+            to->q[k] += bar[k];
+            to->qd[k] += bar[NQ + k] + h*c*bar[k];
+            for (int j = 0; j < i; j++)
+                a_bar[NQ*j + k] += h*(h*AA[j]*bar[k] + A[j]*bar[NQ + k]);
+        }
+#if EOM_INPUTS
+        for (int k = 0; k < EOM_NU; k++)
+            to->u[k] += bar[2*NQ + k];
+#endif
+#if EOM_PARAMETERS
+        for (int k = 0; k < EOM_PARAMETERS; k++)
+            to->p[k] += bar[EOM_VARIABLES - EOM_PARAMETERS + k];
+#endif
+    }
+    return EOM_OK;
+}
+
+/* Replace the derivatives with respect to the end of n recorded steps by those with respect to their start. */
+static eom_status eom_method_pull_back_steps(const eom_adjoint_sums *to, const real *records, long first, long n, const eom_adjoint_run *run, const eom_model *m)
+{
+    enum { RECORD = (2 + EOM_METHOD_STAGES)*EOM_NQ };
+    eom_adjoint_sums sums = *to;
+#if EOM_INPUTS
+    eom_model own = *m;
+#endif
+
+    for (long k = n - 1; k >= 0; k--) {
+        eom_status status;
+
+#if EOM_INPUTS
+        const long row = (first + k)/run->hold;
+
+        own.u = run->u ? run->u + EOM_NU*row : run->u;
+        m = &own;
+        sums.u = to->u + EOM_NU*row;
+#endif
+        status = eom_method_pull_back_step(&sums, records + RECORD*k, run->t0 + (real)(first + k)*run->h, run->h, m);
+        if (status)
+            return status;
+    }
+    return EOM_OK;
+}
+
+/*
+ * The same for n steps from the state q, qd, which are made again. They are made in parts of about sqrt(n) steps: first
+ * all parts, to store the state at the beginning of each, then each part once more, from the last to the first, to
+ * record its steps (checkpointing; Griewank & Walther, Evaluating Derivatives, 2nd ed., ch. 12).
+ */
+static eom_status eom_method_pull_back_interval(const eom_adjoint_sums *to, const real *q, const real *qd, long first, long n, const eom_adjoint_run *run, const eom_model *m, real *work)
+{
+    enum { NQ = EOM_NQ, RECORD = (2 + EOM_METHOD_STAGES)*NQ };
+    eom_status status = EOM_OK;
+    long size = 1, parts;
+    real *records;
+
+    while (size*size < n)
+        size++;
+    parts = (n + size - 1)/size;
+    records = work + 2*NQ*parts;
+    eom_copy_state(records, records + NQ, q, qd);
+    for (long k = 0; k < parts && status == EOM_OK; k++) {
+        const long count = k < parts - 1 ? size : n - size*k;
+        const real *const end = records + RECORD*count;
+
+        eom_copy_state(work + 2*NQ*k, work + 2*NQ*k + NQ, records, records + NQ);
+        status = eom_method_record_steps(records, first + size*k, count, run, m);
+        if (k < parts - 1)
+            eom_copy_state(records, records + NQ, end, end + NQ);
+    }
+    for (long k = parts - 1; k >= 0 && status == EOM_OK; k--) {
+        const long count = k < parts - 1 ? size : n - size*k;
+
+        if (k < parts - 1) {
+            eom_copy_state(records, records + NQ, work + 2*NQ*k, work + 2*NQ*k + NQ);
+            status = eom_method_record_steps(records, first + size*k, count, run, m);
+        }
+        if (status == EOM_OK)
+            status = eom_method_pull_back_steps(to, records, first + size*k, count, run, m);
+    }
+    return status;
+}
+
+/*
+ * Add the derivatives of a function of the rows of a run to `to`, where those with respect to the state are zero before.
+ * q_bars, qd_bars: its derivatives with respect to the rows q_rows, qd_rows. work: see the header of the model.
+ */
+static eom_status eom_method_pull_back_run(const eom_adjoint_sums *to, const real *q_rows, const real *qd_rows, const real *q_bars, const real *qd_bars, const eom_adjoint_run *run, const eom_model *m, real *work)
+{
+    enum { NQ = EOM_NQ };
+    long n = run->steps;
+
+    for (long row = (n + run->every - 1)/run->every; row >= 0; row--) {
+        for (int k = 0; k < NQ; k++) {
+            to->q[k] += q_bars[NQ*row + k];
+            to->qd[k] += qd_bars[NQ*row + k];
+        }
+        if (row > 0) {
+            const long first = run->every*(row - 1);
+            const eom_status status = eom_method_pull_back_interval(to, q_rows + NQ*(row - 1), qd_rows + NQ*(row - 1), first, n - first, run, m, work);
+
+            if (status)
+                return status;
+            n = first;
+        }
+    }
+    if (!eom_finite(to->q, NQ) || !eom_finite(to->qd, NQ))
+        return EOM_NOT_FINITE;
+    return EOM_OK;
+}
