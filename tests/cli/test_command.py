@@ -56,7 +56,7 @@ def test_new_scene_runs_unchanged(scene_folder: Path) -> None:
     assert eomc("new", "crane").exit_code == 0
     ran = eomc("run", "crane.toml", "--out", "run.csv", "--plot", "run.png", "--animate", "a.html")
     assert ran.exit_code == 0, ran.output
-    assert "error at the end about" in ran.output and "steps a second" in ran.output
+    assert "estimated error at the end:" in ran.output and "steps per second" in ran.output
     rows = np.genfromtxt("run.csv", delimiter=",", names=True)
     assert rows.dtype.names == ("t", "theta", "theta_dot", "torque", "energy") and len(rows) == 2001
     assert (scene_folder / "run.png").read_bytes().startswith(b"\x89PNG")
@@ -139,7 +139,8 @@ def test_energy_balance_is_printed(built_folder: Path) -> None:
     output = eomc("run", "kapitza_pendulum.toml").output
     assert "energy K + P 8.73323504 J, changed by at most 18 J; it is not conserved\n" in output
     assert (
-        "Jacobi's integral 8.6428537 J: forces took 1.71 J; numerical error 8.4e-08 J\n" in output
+        "Jacobi's integral 8.6428537 J: work of forces -1.71 J; numerical error 8.4e-08 J\n"
+        in output
     )
     words = ["--json", "--every", "99"]
     balance = json.loads(eomc("run", "kapitza_pendulum.toml", *words).output)["energy"]["balance"]

@@ -91,15 +91,15 @@ def test_negative_zero_is_not_printed(scene_folder: Path) -> None:
 def test_run_of_zero_steps_reports_no_speed(built_folder: Path) -> None:
     result = eomc("run", "p.toml", "--duration", "0")
     assert result.exit_code == 0 and "Simple pendulum: 0 steps of rk4" in result.output
-    assert result.output.endswith(" ms, 0 steps a second\n")
+    assert result.output.endswith(" ms, 0 steps per second\n")
 
 
 def test_growth_of_perturbations_is_not_reported_without_correct_digits(built_folder: Path) -> None:
     """It would be that of the wrong motion: 1 where a linear one diverges."""
     output = eomc("run", "p.toml", "--h", "0.9", "--duration", "100").output
-    assert "  right digits: theta 0\n" in output
+    assert "  correct digits: theta 0\n" in output
     good = eomc("run", "p.toml", "--h", "0.01", "--duration", "1").output
-    assert "; a difference at the start has become " in good
+    assert "; perturbations of the start grow by a factor of " in good
 
 
 def test_quantities_not_finite_at_the_initial_state_are_named(scene_folder: Path) -> None:

@@ -133,12 +133,12 @@ def test_jacobi_integral_is_drawn_where_it_differs_from_energy():
     assert np.array_equal(lines["Jacobi's integral, conserved"], jacobi - jacobi[0])
     assert axes.get_ylabel() == "$E - E(0)$, $J - J(0)$ (J)" and axes.get_legend()
     assert r"Jacobi's integral: max $|J - J(0)|$ = $1\times10^{-9}$ J" in axes.get_title()
-    words = "forces took 2 J; numerical error 1e-09 J"
+    words = "work of forces -2 J; numerical error 1e-09 J"
     *_, axes, _ = plot.make_figure(system, driven, balance=words).axes
-    assert "Jacobi's integral: forces took 2 J\nnumerical error" in axes.get_title()
+    assert "Jacobi's integral: work of forces -2 J\nnumerical error" in axes.get_title()
     assert "Jacobi's integral" in {line.get_label() for line in axes.get_lines()}
     *_, axes, _ = plot.make_figure(system, run, balance=words).axes
-    assert axes.get_title().endswith("; forces took 2 J\nnumerical error 1e-09 J")
+    assert axes.get_title().endswith("; work of forces -2 J\nnumerical error 1e-09 J")
     axes_of_energy = plot.make_figure(system, replace(driven, energy=0 * energy)).axes[-2]
     assert axes_of_energy.get_ylim()[1] < 1e-8  # with the energy only it would be 1
 

@@ -106,7 +106,7 @@ def test_dissipation_of_a_damped_spring_is_exact(pushed: ModuleType) -> None:
     assert balance.is_resolved and balance.inputs == balance.forces == 0
     assert abs(balance.dissipated - dissipated) < 1e-6
     assert abs(pushed.simulate(**EXACT).balance().dissipated - dissipated) < 1e-12
-    assert balance.words.startswith(f"{dissipated:.3g} J were lost; numerical error 1")
+    assert balance.words.startswith(f"dissipated {dissipated:.3g} J; numerical error 1")
 
 
 def test_work_of_inputs_and_of_forces_are_separate(pushed: ModuleType) -> None:
@@ -123,7 +123,7 @@ def test_work_of_inputs_and_of_forces_are_separate(pushed: ModuleType) -> None:
     change = run.energy[-1] - run.energy[0]
     work = balance.inputs + balance.forces - balance.dissipated
     assert abs(work - change) <= balance.error + 1e-14
-    assert "inputs took 1.38 J, forces put in 0.0673 J, 0.101 J were lost; " in balance.words
+    assert "work of inputs -1.38 J, work of forces 0.0673 J, dissipated 0.101 J; " in balance.words
 
 
 @pytest.mark.parametrize("params", [{}, {"c": 2.0, "a": 5.0}])
@@ -156,7 +156,7 @@ def test_quadrature_error_is_bounded_by_the_uncertainty(rows: int, sharpness: fl
 def test_balance_of_too_few_steps_is_unresolved(pushed: ModuleType) -> None:
     balance = pushed.simulate(h=0.9, steps=12).balance()
     assert not balance.is_resolved
-    assert balance.words == "steps are too long to tell what was put in and what was lost"
+    assert balance.words == "the steps are too long to determine the energy balance"
 
 
 def test_rows_that_were_not_stored_are_recomputed(pushed: ModuleType) -> None:
@@ -169,7 +169,7 @@ def test_balance_of_a_conservative_run_is_its_energy_error(cartpole: ModuleType)
     assert (balance.inputs, balance.forces, balance.dissipated) == (0, 0, 0)
     assert balance.error == np.max(np.abs(run.energy - run.energy[0])) > 1e-9
     assert balance.is_resolved and balance.words.startswith(
-        "nothing was put in or lost; numerical error"
+        "no work or dissipation; numerical error"
     )
     assert not model_of(cartpole).functions.has_power
 
@@ -332,7 +332,7 @@ def test_energy_dissipated_in_each_impact_is_exact(
     assert count == 3 and balance.inputs == balance.forces == balance.dissipated == 0
     assert balance.jumps == pytest.approx(-9.81 * (1 - 0.8 ** (2 * count)), rel=1e-12)
     assert balance.is_resolved and balance.error < 1e-9
-    assert balance.words.startswith("jumps took 7.24 J; numerical error")
+    assert balance.words.startswith("added by jumps -7.24 J; numerical error")
     assert pickle.loads(pickle.dumps(balance)) == balance
 
 
@@ -360,7 +360,7 @@ def test_work_between_jumps_is_separate_from_jumps(falling: ModuleType) -> None:
     assert (
         abs(balance.inputs - balance.dissipated + balance.jumps - change) <= balance.error + 1e-12
     )
-    assert "J were lost, jumps took" in balance.words
+    assert " J, added by jumps -" in balance.words
 
 
 def test_jump_that_sheds_mass_takes_its_energy(falling: ModuleType) -> None:
@@ -387,7 +387,7 @@ def test_stick_slip_friction_dissipates_all_and_its_jumps_take_nothing(modules: 
         and balance.forces == pytest.approx(0, abs=1e-9)
     )
     assert balance.dissipated == pytest.approx(dissipated, rel=1e-10) and run.qd[-1, 0] == 0
-    assert balance.words.startswith(f"{dissipated:.3g} J were lost; numerical error")
+    assert balance.words.startswith(f"dissipated {dissipated:.3g} J; numerical error")
 
 
 def test_balance_of_many_jumps_needs_few_rows(falling: ModuleType) -> None:

@@ -106,11 +106,11 @@ def test_rounding_error_is_not_estimated_as_zero(modules: Modules) -> None:
 
 def test_text_of_an_estimate_is_one_line(cartpole: ModuleType) -> None:
     estimate = cartpole.simulate(duration=1.0).estimate()
-    assert str(estimate).startswith(f"error at the end about x {estimate.end['x']:.1g} (")
+    assert str(estimate).startswith(f"estimated error at the end: x {estimate.end['x']:.1g} (")
     assert f", theta {estimate.end['theta']:.1g} ({estimate.digits['theta']:.0f} digits)," in str(
         estimate
     )
-    assert str(estimate).endswith(f" {estimate.amplification:.2g} times as large")
+    assert str(estimate).endswith(f" by a factor of {estimate.amplification:.2g}")
 
 
 def test_run_without_steps_has_no_error(cartpole: ModuleType) -> None:

@@ -162,7 +162,7 @@ def test_command_reports_saturation(tmp_path: Path) -> None:
         .invoke(main, ["run", str(tmp_path / "limited.toml"), "--build", str(tmp_path)])
         .output
     )
-    assert "push beyond its limits, and so at them, in 4" in output, output
+    assert "push is saturated in 4" in output, output
     assert "free beyond" not in output
 
 

@@ -279,7 +279,9 @@ def test_notebook_shows_end_verdict_and_picture(driven: ModuleType, pyplot: Any)
     assert "status: ok" in page and f"{run.q[-1, 1]:.9g} rad" in page
     assert page.count('src="data:image/png;base64,') == 1 and "http" not in page
     error = run.estimate()
-    assert f"error at the end about {max(error.q[-1].max(), error.qd[-1].max()):.1g}" in html(run)
+    assert f"estimated error at the end {max(error.q[-1].max(), error.qd[-1].max()):.1g}" in html(
+        run
+    )
     run.error = dataclasses.replace(error, verdict="steps < motion")
     assert "not resolved: steps &lt; motion" in html(run)
     assert not pyplot.get_fignums()

@@ -422,18 +422,18 @@ def _print_summary(
         say(f"  {name:{wide}} {q: .9g} {unit}{going}".rstrip())
     _print_energy(run, balance, summary)
     for name, times in summary["events"].items():
-        last = f", at t = {times[-1]:.9g} s{' at last' if len(times) > 1 else ''}" if times else ""
+        last = f", {'last ' if len(times) > 1 else ''}at t = {times[-1]:.9g} s" if times else ""
         over = ", which ends the run" if name == summary["stopped_by"] else ""
         say(f"  event {name}: {len(times)} {'time' if len(times) == 1 else 'times'}{last}{over}")
     for name, part in summary["saturated"].items():
-        say(f"  {name} beyond its limits, and so at them, in {max(part, 0.001):.1%} of the rows")
+        say(f"  {name} is saturated in {max(part, 0.001):.1%} of the rows")
     for words in (summary["beyond_stability"], summary["beyond_duration"], summary["remark"]):
         if words:
             say(f"  {words}")
     if run.error is not None:
         _print_error(module, run.error, run)
     speed = summary["steps_per_second"] or 0.0
-    say(f"  {summary['seconds'] * 1e3:.3g} ms, {speed:.3g} steps a second")
+    say(f"  {summary['seconds'] * 1e3:.3g} ms, {speed:.3g} steps per second")
     for file in summary["files"]:
         say(f"  wrote {escape_line(file)}")
 
@@ -457,17 +457,17 @@ def _print_error(module: Any, error: Estimate, run: Trajectory) -> None:
     import math
 
     q, qd = float(error.q[-1].max()), float(error.qd[-1].max())
-    observed = "only rounding seen" if math.isnan(error.observed) else f"seen: {error.observed:.1f}"
-    how = f"in shorter steps; order {error.order}, {observed}"
+    observed = "none above rounding" if math.isnan(error.observed) else f"{error.observed:.1f}"
+    how = f"with smaller steps; order {error.order}, observed {observed}"
     if not run.request.has_equal_steps:
-        how = "with a hundredth of the tolerance" if run.tol else "in steps a quarter as long"
-    size = f"about {q:.1g} in q, {qd:.1g} in qd" if max(q, qd) < math.inf else "unknown"
-    say(f"  error at the end {size} (from the same run {how})")
+        how = "with a hundredth of the tolerance" if run.tol else "with a quarter of the step size"
+    size = f"{q:.1g} in q, {qd:.1g} in qd" if max(q, qd) < math.inf else "unknown"
+    say(f"  estimated error at the end: {size} (from the same run {how})")
     digits = ", ".join(f"{name} {error.digits[name]:.0f}" for name in module.coordinates)
-    grown = f"; a difference at the start has become {error.amplification:.2g} times as large"
+    growth = f"; perturbations of the start grow by a factor of {error.amplification:.2g}"
     if max(error.digits.values()) < 0.5 or not math.isfinite(error.amplification):
-        grown = ""  # of a motion that is not this one
-    say(f"  right digits: {digits}{grown}")
+        growth = ""  # the growth of another motion
+    say(f"  correct digits: {digits}{growth}")
     if error.warning:
         say(f"  {error.warning}")
 

@@ -61,18 +61,17 @@ class Balance:
     def words(self) -> str:
         """Return the supplied and dissipated energy and the numerical error as a sentence, in J."""
         if not self.is_resolved:
-            return "steps are too long to tell what was put in and what was lost"
-        ways = (
-            (self.inputs, "inputs put in {} J", "inputs took {} J"),
-            (self.forces, "forces put in {} J", "forces took {} J"),
-            (self.dissipated, "{} J were lost", "negative damping put in {} J"),
-            (self.jumps, "jumps put in {} J", "jumps took {} J"),
+            return "the steps are too long to determine the energy balance"
+        parts = (
+            ("work of inputs", self.inputs),
+            ("work of forces", self.forces),
+            ("dissipated", self.dissipated),
+            ("added by jumps", self.jumps),
         )
-        messages = [(more if x > 0 else less).format(f"{abs(x):.3g}")
-                 for x, more, less in ways if abs(x) > self.uncertainty]  # fmt: skip
+        messages = [f"{name} {x:.3g} J" for name, x in parts if abs(x) > self.uncertainty]
         error = f"{self.error:.2g}" if self.error > 3 * self.uncertainty else ""
         error = error or f"at most {self.error + self.uncertainty:.1g}"
-        return f"{', '.join(messages) or 'nothing was put in or lost'}; numerical error {error} J"
+        return f"{', '.join(messages) or 'no work or dissipation'}; numerical error {error} J"
 
     def __reduce__(self) -> tuple[Any, ...]:
         return reduced("balance.Balance", *self.__dict__.values())

@@ -98,8 +98,9 @@ class Estimate:
             f"{name} {self.end[name]:.1g} ({digits:.0f} digits)"
             for name, digits in self.digits.items()
         )
-        grown = f"a difference at the start has become {self.amplification:.2g} times as large"
-        return f"error at the end about {'; '.join(x for x in (ends, grown, self.warning) if x)}"
+        growth = f"perturbations grow by a factor of {self.amplification:.2g}"
+        parts = "; ".join(x for x in (ends, growth, self.warning) if x)
+        return f"estimated error at the end: {parts}"
 
     def __reduce__(self) -> tuple[Any, ...]:
         return reduced("estimate.Estimate", *self.__dict__.values())

@@ -415,7 +415,7 @@ def html(run: Any) -> str:
     words.append(f"status: {run.status}" if run.status == "ok" else run.message)
     if run.error is not None:
         error = max(float(np.max(x[-1])) for x in (run.error.q, run.error.qd))
-        words.append(run.error.warning or f"error at the end about {error:.1g}")
+        words.append(run.error.warning or f"estimated error at the end {error:.1g}")
     rows = ["<tr><td>at the end</td></tr>"] if len(run) else []
     for k, name in enumerate(model.info.coordinates[:most] if len(run) else ()):
         unit = plain(model.info.units.get(name, ""))
