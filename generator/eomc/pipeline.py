@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from eomc.emit.render import Sources
     from eomc.model.system import System
     from eomc.program.program import Program
+    from eomc.toolchain.archives import Exported
     from eomc.toolchain.cache import Built
-    from eomc.toolchain.fmu import Exported
 
 
 ScenePath = str | os.PathLike[str]
@@ -157,13 +157,15 @@ def export_fmu(
     EomcError
         If anything else fails.
     """
-    from eomc.toolchain import fmu
+    from eomc.toolchain import archives
 
     _refuse_other(scene, "" if out is None else out)
     fmu_files = unit(
         read(scene) if isinstance(scene, (str, os.PathLike)) else scene, fmi, warn=warn
     )
-    return fmu.export(fmu_files, Path(f"{fmu_files.name}.fmu" if out is None else out), binary)
+    return archives.write_fmu(
+        fmu_files, Path(f"{fmu_files.name}.fmu" if out is None else out), binary
+    )
 
 
 def export(
@@ -336,13 +338,17 @@ def write_wheel(
     warn: function that is called with each warning. Raises SceneError if the scene is invalid and
     EomcError if anything else fails.
     """
-    from eomc.toolchain import wheel
+    from eomc.toolchain import archives
 
     system = read(scene)
     text = Path(scene).read_bytes()
     _tell_preparing(warn)
-    return wheel.build(
-        sources(system, wheel.COMPILED, warn=warn), text, system.digest, system.title, Path(folder)
+    return archives.write_wheel(
+        sources(system, archives.COMPILED, warn=warn),
+        text,
+        system.digest,
+        system.title,
+        Path(folder),
     )
 
 

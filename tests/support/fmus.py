@@ -20,7 +20,7 @@ from eomc.model.system import from_scene
 from eomc.program import program
 from eomc.program.program import Program
 from eomc.scene.read import parse
-from eomc.toolchain import fmu
+from eomc.toolchain import archives
 from support.cases import SCENES
 from support.session import ROOT
 
@@ -161,7 +161,7 @@ def exported(scene: str, version: int) -> Path:
     """
     program = derived_of(scene)
     file = FOLDER / f"{program.system.digest[:12]}-{version}.fmu"
-    return fmu.export(render.unit(program, version), file).file
+    return archives.write_fmu(render.unit(program, version), file).file
 
 
 @cache

@@ -22,14 +22,14 @@ from toolchain.test_installed import create_environment, environment, pip
 from eomc import pipeline
 from eomc.base import resources
 from eomc.cli.main import main
-from eomc.toolchain import wheel
+from eomc.toolchain import archives
 
 NAME = "cartpole-0.1.0+sceneddc4d1636089-cp311-abi3-"
 
 
 def test_no_module_file_has_a_name_that_wheels_write() -> None:
     """A file of runtime/ was once overwritten, so that no wheel could be imported."""
-    assert f"{wheel.COMPILED}.py" not in resources.runtime(batch=True)
+    assert f"{archives.COMPILED}.py" not in resources.runtime(batch=True)
 
 
 def write_wheel_of(folder: Path, text: str) -> Path:
@@ -96,7 +96,7 @@ def test_title_is_one_line_of_metadata(tmp_path: Path, quickly_compiled: None) -
         lines = archive.read(name).decode("utf-8").splitlines()
     assert "Summary: Wägelchen: a, b; Name: x: compiled equations of motion" in lines
     assert [line for line in lines if line.startswith("Name:")] == ["Name: cartpole"]
-    assert wheel._metadata("a", "1", "x\nName: b").count("\nName: ") == 1
+    assert archives._metadata("a", "1", "x\nName: b").count("\nName: ") == 1
 
 
 def test_unwritable_wheel_is_reported(tmp_path: Path, quickly_compiled: None) -> None:
@@ -112,15 +112,15 @@ def test_processor_generations_are_ordered_from_wide_to_narrow(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.delenv("EOMC_CFLAGS", raising=False)
-    monkeypatch.setattr(wheel.platform, "machine", lambda: "x86_64")
-    generations = wheel.generations()
+    monkeypatch.setattr(archives.platform, "machine", lambda: "x86_64")
+    generations = archives.generations()
     assert [g.name for g in generations] == ["avx512", "avx2", "baseline"]
     assert (
         set(generations[0].needs) > set(generations[1].needs) > set(generations[2].needs) == set()
     )
     assert all("-march=native" not in g.flags and "-O3" in g.flags for g in generations)
-    monkeypatch.setattr(wheel.platform, "machine", lambda: "aarch64")
-    assert [g.name for g in wheel.generations()] == ["baseline"]
+    monkeypatch.setattr(archives.platform, "machine", lambda: "aarch64")
+    assert [g.name for g in archives.generations()] == ["baseline"]
 
 
 # --- where it is installed ------------------------------------------------------------------------
