@@ -1,4 +1,4 @@
-"""Two units of FMI that drive each other: an arm by eomc, a PID controller by PythonFMU3.
+"""Co-simulation of two FMUs: an arm by eomc and a PID controller by PythonFMU3.
 
 python docs/examples/fmu_pid.py        (pip install ".[fmu]" installs FMPy and PythonFMU3)
 """
@@ -13,12 +13,12 @@ from pythonfmu3 import FmuBuilder
 
 import eomc
 
-PERIOD = 0.005  # s, of communication
+PERIOD = 0.005  # s, communication step
 HERE = Path(__file__).parent
 
 
 class Unit:
-    """An instance for co-simulation, its variables by name."""
+    """A co-simulation instance with access to its variables by name."""
 
     def __init__(self, file: Path, folder: Path) -> None:
         extract(str(file), str(folder))
@@ -35,7 +35,7 @@ class Unit:
         self.unit.setFloat64([self.of[name]], [value])
 
     def step(self, t: float) -> None:
-        """One period."""
+        """Simulate one communication step."""
         self.unit.doStep(t, PERIOD)
 
 
@@ -45,7 +45,7 @@ with tempfile.TemporaryDirectory() as folder:
     pid_file = FmuBuilder.build_FMU(HERE / "pid_unit.py", dest=at)
     arm, pid = Unit(arm_file, at / "arm"), Unit(at / pid_file, at / "pid")
     pid["target"] = 1.2
-    arm["m"] = 1.5  # lighter than the scene's own
+    arm["m"] = 1.5  # instead of the scene's value
     highest = 0.0
     for k in range(800):
         pid["measured"], pid["rate"] = arm["phi"], arm["phi_dot"]

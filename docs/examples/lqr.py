@@ -1,4 +1,4 @@
-"""LQR of a cart-pole: the motor saturates, the controller has a period of 20 ms.
+"""LQR of a cart-pole with a saturating motor and a control period of 20 ms.
 
 python docs/examples/lqr.py        (SciPy solves the Riccati equation)
 """
@@ -13,7 +13,7 @@ import eomc
 PERIOD = 0.02  # s, four steps
 cartpole = eomc.load(Path(__file__).with_name("balance.toml"))
 
-# x' = Phi x + Gamma u over one period, exact, where the pole stands
+# x' = Phi x + Gamma u over one period, linearized at the upright position
 q, qd, u = cartpole.equilibrium([0.0, 0.0], u=[0.0])
 Phi, Gamma = cartpole.discretize(q, qd, u=u, control_period=PERIOD)
 
@@ -26,6 +26,6 @@ run = cartpole.simulate(
 )
 print("poles of the loop:", np.sort(np.abs(np.linalg.eigvals(Phi - Gamma @ K))).round(3))
 print(f"force between {run['force'].min():.2f} and {run['force'].max():.2f} N,", end=" ")
-print(f"beyond its limits at {run.saturated.sum()} of {len(run)} rows")
+print(f"saturated at {run.saturated.sum()} of {len(run)} rows")
 print(f"at the end x = {run.q[-1, 0]:.5f} m, theta = {run.q[-1, 1]:.5f} rad")
 print(f"exact to {run.error.q[-1].max():.1g}")

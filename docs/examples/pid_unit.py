@@ -1,4 +1,4 @@
-"""A PID controller as a unit of FMI 3.0, made by PythonFMU3 for fmu_pid.py.
+"""A PID controller as an FMU of FMI 3.0, made with PythonFMU3 for fmu_pid.py.
 
 pythonfmu3 build -f docs/examples/pid_unit.py        (makes the file alone)
 """
@@ -32,7 +32,7 @@ class Pid(Fmi3Slave):
             )
 
     def do_step(self, current_time, step_size):
-        """One period."""
+        """Compute the output for one communication step."""
         error = self.target - self.measured
         self.integral += error * step_size
         self.output = self.kp * error + self.ki * self.integral - self.kd * self.rate

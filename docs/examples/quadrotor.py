@@ -13,7 +13,7 @@ import eomc
 PERIOD = 0.02  # s, four steps
 quadrotor = eomc.load(Path(__file__).parents[2] / "scenes" / "quadrotor.toml")
 
-# z' = Phi z + Gamma u of the changes z = T^T (x - x0) that keep the quaternion's length
+# z' = Phi z + Gamma u for the variations z = T^T (x - x0) that preserve the norm of the quaternion
 q0, qd0, u0 = quadrotor.equilibrium()
 T = quadrotor.tangent(q0, qd0)
 Phi, Gamma = quadrotor.discretize(q0, qd0, u=u0, control_period=PERIOD)
@@ -24,8 +24,8 @@ K = np.linalg.solve(R + Gamma.T @ P @ Gamma, Gamma.T @ P @ Phi) @ T.T
 
 
 def law(t, q, qd):
-    """The thrusts, held over a period."""
-    sign = np.where(q[3] < 0, [1, 1, 1, -1, -1, -1, -1], 1)  # both signs are one attitude
+    """Return the thrusts, held constant over a period."""
+    sign = np.where(q[3] < 0, [1, 1, 1, -1, -1, -1, -1], 1)  # q and -q are the same attitude
     return u0 - K @ np.concatenate([sign * q - q0, sign * qd])
 
 

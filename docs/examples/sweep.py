@@ -1,4 +1,4 @@
-"""A sweep over masses in a pool of processes: how far may the pole lean and still be caught?
+"""Parameter study in a pool of processes: the largest initial angle that the LQR can balance.
 
 python docs/examples/sweep.py
 """
@@ -15,7 +15,7 @@ K = np.array([-8.7, 63.4, -9.9, 16.0])  # of lqr.py
 
 
 def caught(cartpole, mass, lean):
-    """Whether the pole of that mass comes back from leaning so far."""
+    """Return whether the pole of this mass is balanced from this initial angle."""
     run = cartpole.simulate(
         q0=[0, lean], u=lambda t, q, qd: [-K @ [*q, *qd]], control_period=0.02,
         params={"m_p": mass},
@@ -24,7 +24,7 @@ def caught(cartpole, mass, lean):
 
 
 def farthest(cartpole, mass):
-    """The largest lean that is caught, to a thousandth of a radian."""
+    """Return the largest angle that is balanced, to a thousandth of a radian."""
     low, high = 0.0, 1.5
     while high - low > 1e-3:
         middle = (low + high) / 2
@@ -33,8 +33,8 @@ def farthest(cartpole, mass):
 
 
 if __name__ == "__main__":
-    cartpole = eomc.load(Path(__file__).with_name("balance.toml"))  # built once, here
+    cartpole = eomc.load(Path(__file__).with_name("balance.toml"))  # built once, in this process
     masses = np.linspace(0.1, 0.8, 8)
-    with ProcessPoolExecutor() as pool:  # modules travel to other processes
+    with ProcessPoolExecutor() as pool:  # modules are pickled for other processes
         for mass, lean in zip(masses, pool.map(partial(farthest, cartpole), masses), strict=True):
             print(f"{mass:.1f} kg: up to {lean:.3f} rad")

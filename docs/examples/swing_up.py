@@ -1,4 +1,4 @@
-"""Swing-up of a cart-pole: pumped until it has the energy to stand, then caught by LQR.
+"""Energy-based swing-up of a cart-pole, then LQR.
 
 python docs/examples/swing_up.py
 """
@@ -21,7 +21,7 @@ SWING = cartpole.outputs.index("swing")
 
 
 def law(t, q, qd):
-    """The force: LQR where the pole is nearly up and slow, else what brings it the energy."""
+    """Return the force: LQR near the upright position, otherwise a law that raises the energy."""
     angle = np.remainder(q[1] + np.pi, 2 * np.pi) - np.pi
     if abs(angle) < 0.4 and abs(qd[1]) < 3:
         return -K @ [q[0], angle, *qd]

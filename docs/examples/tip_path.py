@@ -1,4 +1,4 @@
-"""The path of a double pendulum's tip as CSV. The command does the same:
+"""Write the path of a double pendulum's tip as CSV. The command does the same:
 
     eomc run docs/examples/double_pendulum.toml --every 10 --out path.csv
 

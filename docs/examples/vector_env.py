@@ -1,4 +1,4 @@
-"""A vector environment of gymnasium: many cart-poles side by side, observed by their outputs.
+"""A vector environment of gymnasium: a batch of cart-poles, observed by their outputs.
 
 python docs/examples/vector_env.py     (pip install gymnasium)
 """
@@ -16,7 +16,7 @@ cartpole = eomc.load(Path(__file__).with_name("balance.toml"))
 
 
 class CartPoles(VectorEnv):
-    """Keep the pole up; an episode ends where it leans more than 0.5 rad, and a new one begins."""
+    """Balance the pole; an episode ends if the angle exceeds 0.5 rad, and a new one begins."""
 
     def __init__(self, count):
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
@@ -27,14 +27,14 @@ class CartPoles(VectorEnv):
         self.action_space = batch_space(self.single_action_space, count)
 
     def reset(self, *, seed=None, options=None, which=slice(None)):
-        """New starts, of all or of `which`; what is observed there."""
+        """Draw new initial states of all instances or of `which`; return their observations."""
         super().reset(seed=seed)
         new = self.np_random.uniform(-0.1, 0.1, (2, self.num_envs, 2))
         self.q[which], self.qd[which] = new[0][which], new[1][which]
         return cartpole.output(self.q, self.qd), {}
 
     def step(self, actions):
-        """One control period under these forces; who has fallen starts anew."""
+        """Simulate one control period with these forces; reset the poles that have fallen."""
         for _ in range(4):  # a control period of 20 ms
             failed = cartpole.step_batch(self.q, self.qd, 0.005, u=actions)
         over = (np.abs(self.q[:, 1]) > 0.5) | (failed > 0)
@@ -44,7 +44,7 @@ class CartPoles(VectorEnv):
 
 
 def falls(law, steps=250):
-    """How often each pole falls under a law from observations to forces, in 5 s."""
+    """Return the mean number of falls in 5 s with a law from observations to forces."""
     observations, count = poles.reset(seed=1)[0], 0
     for _ in range(steps):
         observations, _, over, _, _ = poles.step(law(observations))
@@ -54,7 +54,8 @@ def falls(law, steps=250):
 
 poles = CartPoles(256)
 poles.action_space.seed(1)
-feedback = np.array([[54.7, -63.4, 0.0, -9.9, 16.0, 0.0]]).T  # of lqr.py, by what is observed
+# the gains of lqr.py, in terms of the observations
+feedback = np.array([[54.7, -63.4, 0.0, -9.9, 16.0, 0.0]]).T
 print("observed:", *cartpole.outputs)
 print(f"random forces: {falls(lambda seen: poles.action_space.sample()):.1f} falls of each in 5 s")
 print(f"a feedback: {falls(lambda seen: -seen @ feedback):.1f} falls of each in 5 s")

@@ -1,6 +1,6 @@
 /*
- * A cart-pole held upright at 1 kHz for ten minutes: a Kalman filter on noisy positions, an LQR
- * and the plant, all by the generated C. Prints how well it stood, and how long a period takes.
+ * Balance a cart-pole at 1 kHz for ten minutes: a Kalman filter with noisy positions, an LQR and
+ * the plant, all with the generated C. Print the largest deviations and the time of a period.
  *
  *     python gains.py ../balance.toml > gains.h
  *     eomc build ../balance.toml --c balance
@@ -20,7 +20,7 @@ enum { NQ = BALANCE_NQ, NX = 2*NQ, PERIODS = 600000 };
 
 static const double H = 0.001, NOISE = 0.001; /* s; m and rad, of a measurement */
 
-/* What the filter knows: the state, and the covariance of its error. */
+/* The estimate of the filter: the state, and the covariance of its error. */
 typedef struct {
     double q[NQ], qd[NQ], P[NX*NX];
 } filter;
@@ -52,7 +52,7 @@ static int predict(filter *f, const double *u, const balance_params *p)
     return 0;
 }
 
-/* Update by one position at a time, whose noises are independent. */
+/* Update with one measured position at a time; their noises are independent. */
 static void update(filter *f, const double *measured)
 {
     for (int m = 0; m < NQ; m++) {
@@ -73,7 +73,7 @@ static void update(filter *f, const double *measured)
     }
 }
 
-/* One period of the controller: what is measured in, the force out. */
+/* One period of the controller: computes the force u from the measured positions. */
 static int control(filter *f, double *u, const double *measured, const balance_params *p)
 {
     const int status = predict(f, u, p);

@@ -1,6 +1,6 @@
 /*
- * The start of a Cortex-M for programs in QEMU: vectors, the FPU switched on, newlib's own start.
- * A board brings its own of its maker.
+ * Startup code of a Cortex-M in QEMU: the vector table, the FPU, and newlib's own start.
+ * For a board use the startup code of its manufacturer.
  */
 #include <stdint.h>
 
