@@ -159,7 +159,7 @@ def test_gradients_do_not_depend_on_the_rows_that_are_stored(
     """Without repetition, steps between two rows are made again in parts."""
     m, random = modules.unoptimised(text), np.random.default_rng(2)
     if not repeats:
-        own = import_module(f"{m.Trajectory.__module__.rpartition('.')[0]}.adjoint")
+        own = import_module(f"{m.Trajectory.__module__.rpartition('.')[0]}.sensitivity")
         monkeypatch.setattr(own, "MAX_REPEATED_NUMBERS", 0)
     n, steps, h = m.nq, 120, 0.01
     q, qd, dq, dqd, last = random.standard_normal((5, n)) * 0.3

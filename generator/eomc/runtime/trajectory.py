@@ -21,9 +21,8 @@ from .saved import NOT_STORED
 from .status import STATUS_MESSAGES, Interrupted, MotionError, state_text
 
 if TYPE_CHECKING:
-    from .adjoint import RunGradient
     from .balance import Balance
-    from .sensitivity import Sensitivity
+    from .sensitivity import RunGradient, Sensitivity
 
 
 @dataclass(eq=False, repr=False)
@@ -352,7 +351,7 @@ class Trajectory(Columns):
         W. W. Hager, Runge-Kutta methods in optimal control and the transformed adjoint system,
         Numer. Math. 87 (2000), 247-282.
         """
-        from .adjoint import pull_back
+        from .sensitivity import pull_back
 
         return pull_back(self, self._replayed_request(), q_bar, qd_bar)
 
