@@ -73,22 +73,42 @@ static eom_status eom_differentiate_accelerations(real *J, const real *q, const 
     return EOM_OK;
 }
 
-/* R, V = the derivatives of position and velocity at stage i of an explicit method. */
-static void eom_method_stage_derivatives(real *R, real *V, const real *X, int i, real h)
+/*
+ * X = the derivatives of the accelerations at stage i of an explicit method, from those at the stages before it,
+ * stage by stage, and the derivatives J by the state of stage i. With sums S = sum_j A_ij X_j and SS = sum_j AA_ij X_j,
+ * the derivatives of that state are [1, h c, 0] + h^2 SS and [0, 1, 0] + h S, whose constant parts need no product.
+ */
+static void eom_method_stage_derivatives(real *X, const real *J, int i, real h)
 {
     enum { NQ = EOM_NQ, W = EOM_VARIABLES };
-    const real *const A = eom_method_A[i], *const AA = eom_method_AA[i];
+    const real *const A = eom_method_A[i], *const AA = eom_method_AA[i], c = eom_method_c[i];
+    real *const own = X + W*NQ*i;
+    real S[NQ*W], SS[NQ*W];
 
+    for (int k = 0; k < NQ; k++) {
+        for (int w = 0; w < W; w++)
+            own[W*k + w] = J[W*k + w];
+        for (int l = 0; l < NQ; l++)
+            own[W*k + NQ + l] += h*c*J[W*k + l];
+    }
+    if (i == 0)
+        return;
+    for (int k = 0; k < NQ*W; k++) {
+        real of_q = 0, of_qd = 0;
+
+        for (int j = 0; j < i; j++) {
+            of_q += AA[j]*X[W*NQ*j + k];
+            of_qd += A[j]*X[W*NQ*j + k];
+        }
+        SS[k] = h*h*of_q;
+        S[k] = h*of_qd;
+    }
     for (int k = 0; k < NQ; k++)
-        for (int w = 0; w < W; w++) {
-            real of_q = 0, of_qd = 0;
+        for (int l = 0; l < NQ; l++) {
+            const real by_q = J[W*k + l], by_qd = J[W*k + NQ + l];
 
-            for (int j = 0; j < i; j++) {
-                of_q += AA[j]*X[W*(NQ*j + k) + w];
-                of_qd += A[j]*X[W*(NQ*j + k) + w];
-            }
-            R[W*k + w] = (real)(w == k) + h*(eom_method_c[i]*(real)(w == NQ + k) + h*of_q);
-            V[W*k + w] = (real)(w == NQ + k) + h*of_qd;
+            for (int w = 0; w < W; w++)
+                own[W*k + w] += by_q*SS[W*l + w] + by_qd*S[W*l + w];
         }
 }
 
@@ -96,26 +116,18 @@ static void eom_method_stage_derivatives(real *R, real *V, const real *X, int i,
 static eom_status eom_method_differentiate_explicit_stages(real *X, real *a, const real *q, const real *qd, real t, real h, const eom_model *m)
 {
     enum { NQ = EOM_NQ, W = EOM_VARIABLES };
-    real J[NQ*W], R[NQ*W], V[NQ*W], r[NQ], v[NQ];
+    real J[NQ*W], r[NQ], v[NQ];
 
     for (int i = 0; i < EOM_METHOD_STAGES; i++) {
         eom_status status;
 
         eom_method_stage_state(r, v, a, i, i, q, qd, h);
-        eom_method_stage_derivatives(R, V, X, i, h);
         status = eom_accelerate(a + NQ*i, r, v, t + eom_method_c[i]*h, m);
         if (status == EOM_OK)
             status = eom_differentiate_accelerations(J, r, v, t + eom_method_c[i]*h, m);
         if (status)
             return status;
-        for (int k = 0; k < NQ; k++)
-            for (int w = 0; w < W; w++) {
-                real sum = w < 2*NQ ? 0 : J[W*k + w];
-
-                for (int l = 0; l < NQ; l++)
-                    sum += J[W*k + l]*R[W*l + w] + J[W*k + NQ + l]*V[W*l + w];
-                X[W*(NQ*i + k) + w] = sum;
-            }
+        eom_method_stage_derivatives(X, J, i, h);
     }
     return EOM_OK;
 }
