@@ -133,7 +133,7 @@ clean:
 	@touch $@
 
 # half a gigabyte of robots, the simulator that they are held against, compilers for other machines,
-# importers of units of FMI, Dask for sweeps
+# importers of units of FMI, Dask for sweeps, JAX for exports
 .venv/robots: .venv/dev
-	$(INSTALL) --editable ".[robots,cross,fmu,cluster]"
+	$(INSTALL) --editable ".[robots,cross,fmu,cluster,jax]"
 	@touch $@

@@ -26,6 +26,9 @@ needs_scipy = pytest.mark.skipif(
 needs_casadi = pytest.mark.skipif(
     importlib.util.find_spec("casadi") is None, reason="CasADi is not installed"
 )
+needs_jax = pytest.mark.skipif(
+    importlib.util.find_spec("jax") is None, reason="JAX is not installed: pip install '.[jax]'"
+)
 
 
 @cache
@@ -91,6 +94,16 @@ def test_model_predictive_control_keeps_the_double_pendulum_upright() -> None:
     travel, force = numbers(text, r"up to (\S+) m, force up to (\S+) N")
     assert travel < 0.8 and 5 < force <= 30
     assert all(abs(x) < 0.05 for x in numbers(text, r"= (\S+) m, a1 = (\S+) rad, a2 = (\S+) rad"))
+
+
+@needs_jax
+@pytest.mark.slow
+def test_policy_gradient_learns_to_balance() -> None:
+    text = run_script("policy_gradient.py")
+    first, last = numbers(text, r"cost (\S+) before and (\S+) after")
+    assert first > 1 and last < 0.1
+    x, theta = numbers(text, r"x = (\S+) m, theta = (\S+) rad")
+    assert abs(x) < 0.2 and abs(theta) < 0.02
 
 
 @pytest.mark.slow

@@ -184,7 +184,8 @@ def export(
         Path of the TOML file, or a System.
     library
         "casadi": accelerations as symbolic expressions in Python; accelerations and steps as
-        compiled external functions with Jacobians.
+        compiled external functions with derivatives. "jax", "torch": accelerations and steps of
+        many states as differentiable functions.
     folder
         Folder of the package, by default <name of the scene>_<library> in the current folder. Files
         that eomc did not write are not replaced.
@@ -210,9 +211,12 @@ def export(
     system = exports.differentiable(system, library, h)
     program = _program(system, warn)
     folder = Path(f"{system.name}_{library}" if folder is None else folder)
-    texts = render.casadi_package(program)
+    texts = render.export_package(program, library)
     write_c_folder(texts, folder)
-    _write_library(f"{system.name}_{library}", texts, program, folder, warn)
+    if library == "casadi":
+        _write_library(f"{system.name}_{library}", texts, program, folder, warn)
+    else:
+        build(system, folder, warn=None)
     return folder
 
 

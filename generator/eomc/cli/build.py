@@ -193,5 +193,11 @@ _export_package(
     "casadi",
     "Write a package for CasADi.",
     "Write a package for CasADi: the accelerations as SX expressions, for IPOPT and acados, and "
-    "accelerations and steps as compiled external functions with Jacobians.",
+    "accelerations and steps as compiled external functions with derivatives.",
+)
+_export_package(
+    "jax",
+    "Write a package for JAX.",
+    "Write a package for JAX: accelerations and steps as functions with custom derivatives in "
+    "reverse mode, for many states at once.",
 )

@@ -16,8 +16,10 @@ from eomc.emit.common.c_function import break_long_lines
 from eomc.emit.common.c_names import local_name, rename_reserved
 from eomc.emit.common.functions import SceneFunctions
 from eomc.emit.common.templates import show
+from eomc.integrators.tableaux import METHODS
 from eomc.model.system import System
 from eomc.program.ir import Call, Operand
+from eomc.program.program import TIME
 
 LIBRARIES = {"casadi": "CasADi", "jax": "JAX", "torch": "PyTorch"}
 # functions of the program that CasADi has under another name, or that Python has itself
@@ -45,7 +47,17 @@ def differentiable(system: System, library: str, h: float | None) -> System:
         )
         raise SceneError([system.problem("event.1", why)])
     run = replace(system.run, linearize="products", discretize=True, real="double")
+    if library != "casadi":  # many states at once, which implicit methods do not have
+        explicit = tuple(m for m in run.methods if not METHODS[m].implicit)
+        run = replace(run, methods=explicit or ("rk4",), tolerance=None, batch=True)
     return replace(system, run=run if h is None else replace(run, h=h))
+
+
+def _depends_on_time(functions: SceneFunctions) -> bool:
+    """Return True if accelerations or projections depend on the time other than through inputs."""
+    names = ("acceleration", "projection")
+    program = functions.target.program
+    return any(name in program and TIME in program[name].uses for name in names)
 
 
 # --- CasADi ---------------------------------------------------------------------------------------
@@ -110,7 +122,10 @@ def casadi_files(functions: SceneFunctions) -> dict[str, str]:
     """Return the C and the Python of a package for CasADi, besides the portable C, by file name."""
     lines, results = _symbolic_lines(functions)
     called = _called(functions)
-    text = show("exports/casadi.c", functions, patterns=dict(_patterns(functions)))
+    text = show(
+        "exports/casadi.c", functions, patterns=dict(_patterns(functions)),
+        timed=_depends_on_time(functions),
+    )  # fmt: skip
     names = {C_NAMES[name] for name in called - _COMPOSED}
     names |= {"sign"} if called & {"cbrt", "sign", "heaviside"} else set()
     names |= {"erf"} if "erfc" in called else set()
@@ -119,3 +134,18 @@ def casadi_files(functions: SceneFunctions) -> dict[str, str]:
         imported=sorted({*names, *({"fabs"} if "cbrt" in called else ())}), local=local_name,
     )  # fmt: skip
     return {f"{functions.prefix}_casadi.c": break_long_lines(text), "__init__.py": symbolic}
+
+
+# --- JAX and PyTorch ------------------------------------------------------------------------------
+
+
+def array_files(functions: SceneFunctions, library: str) -> dict[str, str]:
+    """Return the Python of a package for JAX or PyTorch, by file name.
+
+    The scene's built module is a subpackage of the package.
+    """
+    timed = _depends_on_time(functions)
+    return {
+        "__init__.py": show(f"exports/{library}.py", functions, timed=timed),
+        "_arrays.py": show("exports/arrays.py", functions, timed=timed),
+    }

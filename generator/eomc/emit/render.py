@@ -132,11 +132,14 @@ def unit(program: Program, version: int) -> Unit:
     return render_unit(functions, version, files)
 
 
-def casadi_package(program: Program) -> dict[str, str]:
-    """Return the package of a program for CasADi, as texts by file name: portable C, functions with
-    CasADi's calling convention on top of it, and the accelerations in Python.
+def export_package(program: Program, library: str) -> dict[str, str]:
+    """Return the package of a program for a library of `exports.LIBRARIES`, as texts by file name.
+
+    A package for CasADi contains portable C; the others need the built module as a subpackage.
     """
     _plain_names(program)
     program, written = rename_for_c(program)
     functions = SceneFunctions(Target(program, REALS[program.system.run.real], written))
+    if library != "casadi":
+        return exports.array_files(functions, library)
     return {**portable.files(program, written=written), **exports.casadi_files(functions)}
