@@ -38,7 +38,6 @@ static eom_status eom_method_record_steps(real *records, long first, long n, con
 
     for (long k = 0; k < n; k++) {
         real *const q = records + RECORD*k, *const qd = q + NQ, *const a = qd + NQ, *const next = a + S*NQ;
-        const real t = run->t0 + (real)(first + k)*run->h;
         real r[EOM_WIDTH], v[EOM_WIDTH], qdd[EOM_WIDTH] = { 0 };
 
 #if EOM_INPUTS
@@ -49,7 +48,7 @@ static eom_status eom_method_record_steps(real *records, long first, long n, con
             eom_status status;
 
             eom_method_stage_state(r, v, a, i, i, q, qd, run->h);
-            status = eom_accelerate(qdd, r, v, t + eom_method_c[i]*run->h, m);
+            status = eom_accelerate(qdd, r, v, run->t0 + (real)(first + k)*run->h + eom_method_c[i]*run->h, m);
             if (status)
                 return status;
             for (int l = 0; l < NQ; l++)
