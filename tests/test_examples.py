@@ -84,6 +84,17 @@ def test_pole_is_swung_up() -> None:
     assert 0 < numbers(text, r"saturated (\d+)%")[0] < 50
 
 
+@needs_scipy
+@pytest.mark.slow
+def test_parameters_of_a_drive_are_identified() -> None:
+    text = run_script("identification.py")
+    errors = numbers(text.partition("errors in standard errors:")[2].splitlines()[0], r"(-?\d\.\d)")
+    assert len(errors) == 5 and all(abs(x) < 4 for x in errors)
+    assert 0 < numbers(text, r"k +(\S+) ±")[0] - 7.95 < 0.1
+    assert numbers(text, r"noise (\S+) rad")[0] == pytest.approx(0.002, rel=0.05)
+    assert (FOLDER / "drive_fit.png").exists()
+
+
 @needs_casadi
 @pytest.mark.slow
 def test_model_predictive_control_keeps_the_double_pendulum_upright() -> None:

@@ -12,13 +12,14 @@ from eomc.base.resources import __version__
 from eomc.pipeline import build, export, export_fmu, load, read, sources
 
 if TYPE_CHECKING:
+    from eomc.identification import fit
     from eomc.model.system import System, dot
     from eomc.report.equations import equations
     from eomc.sweeps.sweep import sweep
 
 __all__ = [
     "EomcError", "SceneError", "System", "__version__", "build", "dot", "equations", "export",
-    "export_fmu", "load", "read", "sources", "sweep",
+    "export_fmu", "fit", "load", "read", "sources", "sweep",
 ]  # fmt: skip
 
 
@@ -28,7 +29,7 @@ def __dir__() -> list[str]:
 
 
 def __getattr__(name: str) -> object:
-    """Import System, dot, equations or sweep on first use: SymPy alone takes half a second."""
+    """Import System, dot, equations, fit or sweep on first use: SymPy alone takes half a second."""
     if name in ("System", "dot"):
         from eomc.model import system
 
@@ -37,6 +38,10 @@ def __getattr__(name: str) -> object:
         from eomc.report.equations import equations
 
         return equations
+    if name == "fit":
+        from eomc.identification import fit
+
+        return fit
     if name == "sweep":
         from eomc.sweeps.sweep import sweep
 

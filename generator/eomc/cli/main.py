@@ -1,4 +1,4 @@
-"""The command: eomc new, import, build, check, run, sweep, report, show, schema, export, dof, list.
+"""The command: eomc new, import, build, check, run, fit, sweep, report, show, export and others.
 
 Exit status: 0 for success, 1 if a check failed or a run could not continue, 2 for bad input. A
 command's module is imported when the command is called, and slow imports (SymPy, rich)
@@ -22,8 +22,8 @@ from eomc.cli.options import fail, say
 # name of each command, and the module with the function <name>_command
 COMMANDS = {
     "build": "build", "check": "inspection", "dof": "inspection", "export": "build",
-    "import": "scenes", "list": "scenes", "new": "scenes", "report": "inspection", "run": "run",
-    "schema": "scenes", "show": "inspection", "sweep": "run",
+    "fit": "run", "import": "scenes", "list": "scenes", "new": "scenes", "report": "inspection",
+    "run": "run", "schema": "scenes", "show": "inspection", "sweep": "run",
 }  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""eomc run: a simulation, its end, error and speed; eomc sweep: many trajectories of a scene."""
+"""eomc run: a simulation; eomc sweep: many trajectories; eomc fit: estimates from a log."""
 
 from __future__ import annotations
 
@@ -636,3 +636,97 @@ def _print_sweep_end(command: SimpleNamespace, path: Path, state: SweepProgress)
             say(f"  {count:,} failed: {status}")
         for file in filter(None, (command.plot, command.parquet)):
             say(f"wrote {escape_line(file)}")
+
+
+# --- eomc fit -------------------------------------------------------------------------------------
+
+
+@click.command("fit")
+@options.SCENE
+@click.argument("log", type=click.Path(path_type=Path))
+@options.BUILD
+@click.option(
+    "--free", metavar="NAME,...",
+    help="Values to estimate: parameters, and coordinates or velocities NAME_dot, whose initial "
+    "values are estimated. By default all parameters.",
+)  # fmt: skip
+@click.option(
+    "--set", "parameters", multiple=True, metavar="NAME=VALUE",
+    help="Value of a parameter: the initial guess of a free one.",
+)  # fmt: skip
+@click.option(
+    "--start", multiple=True, metavar="NAME=VALUE",
+    help="Initial value of a coordinate, or of its velocity NAME_dot.",
+)  # fmt: skip
+@click.option(
+    "--bounds", multiple=True, metavar="NAME=LOW:HIGH", help="Bounds of a free value; one may lack."
+)
+@click.option("--h", "h", type=float, help="Largest step size in s, instead of the scene's.")
+@click.option(
+    "--plot", type=click.Path(path_type=Path), help="Plot the fit: FILE.png, .svg or .pdf."
+)
+@options.QUIET
+@options.JSON
+@options.parse_into(SimpleNamespace)
+def fit_command(arguments: SimpleNamespace) -> None:
+    """Estimate parameters from measured columns; LOG is a CSV file.
+
+    The first line of LOG has the names of the columns: t, and coordinates, velocities (theta_dot),
+    outputs or inputs of the scene.
+
+    \b
+    eomc fit pendulum.toml log.csv --free l,damping --plot fit.png
+    eomc fit pendulum.toml log.csv --free l,theta,theta_dot --bounds l=0:2
+    """
+    from eomc.identification import fit
+
+    options.check_target(arguments.plot, (".png", ".svg", ".pdf"), "--plot")
+    system = pipeline.read(arguments.scene)
+    known = {p.name: p.value for p in system.parameters}
+    free = None if arguments.free is None else [n.strip() for n in arguments.free.split(",")]
+    with status_line(f"fitting {arguments.scene.stem}", arguments.quiet or arguments.as_json):
+        result = fit(
+            system, arguments.log, free=free,
+            values={
+                **dict(parse_pairs(arguments.parameters, "--set", known)),
+                **dict(parse_pairs(arguments.start, "--start", known)),
+            },
+            bounds=dict(_parse_bounds(arguments.bounds)), h=arguments.h, root=arguments.root,
+        )  # fmt: skip
+    if arguments.plot:
+        result.write_plot(arguments.plot)
+    if arguments.as_json:
+        names = ("values", "standard_errors", "correlation", "without_effect", "ambiguous", "rms",
+                 "ignored", "success", "message", "evaluations")  # fmt: skip
+        summary = {name: _json_value(getattr(result, name)) for name in names}
+        say(json.dumps(summary, indent=1))
+    elif not arguments.quiet:
+        say(str(result))
+        if arguments.plot:
+            say(f"  wrote {escape_line(arguments.plot)}")
+    sys.exit(1 if result.warnings else 0)
+
+
+def _json_value(value: Any) -> Any:
+    """Return a value for JSON, which has no nan: None in its place."""
+    if isinstance(value, dict):
+        return {name: _json_value(x) for name, x in value.items()}
+    if hasattr(value, "tolist"):
+        return [_json_value(x) for x in value.tolist()]
+    if isinstance(value, list):
+        return [*map(_json_value, value)]
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def _parse_bounds(arguments: Sequence[str]) -> Iterator[tuple[str, tuple[float, float]]]:
+    """Parse arguments NAME=LOW:HIGH; a bound that is left out is infinite. Raises EomcError."""
+    for text in arguments:
+        name, _, pair = text.partition("=")
+        low, colon, high = pair.partition(":")
+        try:
+            bounds = float(low or -math.inf), float(high or math.inf)
+        except ValueError:
+            colon = ""
+        if not colon:
+            raise EomcError(f"--bounds {text}: write --bounds NAME=LOW:HIGH, such as m=0:5")
+        yield name.strip(), bounds
