@@ -228,7 +228,7 @@ def test_step_size_of_an_export_is_chosen(tmp_path: Path) -> None:
     assert package.h == 0.05
 
 
-@pytest.mark.parametrize("library", ["casadi", "jax"])
+@pytest.mark.parametrize("library", ["casadi", "jax", "torch"])
 def test_what_has_no_derivatives_is_refused_by_name(library: str, tmp_path: Path) -> None:
     scene = tmp_path / "scene.toml"
     event = '[[event]]\nname = "ground"\nwhen = "y"\naction = "stop"\n'
@@ -248,7 +248,7 @@ def test_what_has_no_derivatives_is_refused_by_name(library: str, tmp_path: Path
         (tmp_path / "__init__.py").write_text("mine = 1\n", encoding="utf-8")
         result = CliRunner().invoke(main, ["export", library, str(scene), *words])
         assert result.exit_code == 2 and message in result.output, result.output
-    with pytest.raises(EomcError, match="one of casadi, jax"):
+    with pytest.raises(EomcError, match="one of casadi, jax, torch"):
         eomc.export(scene, "tensorflow", tmp_path / "folder")
     assert not (tmp_path / "folder").exists()
 
@@ -397,6 +397,67 @@ def test_time_advances_in_runs_of_jax_and_has_no_derivative() -> None:
     assert np.allclose(q, run.q[3::3], rtol=1e-12)
 
 
+# --- PyTorch --------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", ["cartpole_driven", SMOOTH, "kapitza_pendulum"], ids=name_of)
+def test_gradients_of_torch_agree_with_symbolic_derivatives(scene: str) -> None:
+    package = exported(scene, "torch")
+    import torch
+
+    symbolic = exported(scene, "casadi")
+    (x, u, p), n, h = random_point(symbolic, 2), symbolic.nq, 0.01
+    weights = np.linspace(0.5, 1.5, 2 * n)
+    step, f = symbolic_step(symbolic, 3, h), symbolic_acceleration(symbolic.function(), n)
+    values = [torch.tensor(v, requires_grad=True) for v in (x, u, p)]
+    state, inputs, parameters = values
+    qdd = package.acceleration(state[:n], state[n:], inputs, parameters, 0.3)
+    assert_close([qdd.detach()], [dense(f(x, u, p))])
+    (torch.tensor(weights[:n]) @ qdd).backward()
+    assert_close([v.grad for v in values], gradients(f, weights[:n], x, u, p))
+    for v in values:
+        v.grad = None
+    end = torch.cat(package.step(state[:n], state[n:], inputs, parameters, 0.3, h=h, steps=3))
+    (torch.tensor(weights) @ end).backward()
+    assert_close([end.detach()], [dense(step(x, u, p))])
+    assert_close([v.grad for v in values], gradients(step, weights, x, u, p))
+
+
+@pytest.mark.slow
+def test_batches_and_runs_of_torch_agree_with_the_module() -> None:
+    package = exported("cartpole_driven", "torch")
+    import torch
+
+    generator = torch.Generator().manual_seed(0)
+    q, qd, u = (torch.randn(4, 3, k, generator=generator, dtype=torch.double) for k in (2, 2, 1))
+    p = (package.defaults * torch.linspace(0.9, 1.1, 4)[:, None, None]).requires_grad_()
+    end = package.step(q, qd, u, p, h=0.02)
+    (end[0] * end[1]).sum().backward()
+    for k in range(4):
+        own = p[k, 0].detach().clone().requires_grad_()
+        single = package.step(q[k], qd[k], u[k], own, h=0.02)
+        (single[0] * single[1]).sum().backward()
+        assert torch.allclose(own.grad, p.grad[k, 0], rtol=1e-12)
+        assert torch.allclose(single[0], end[0][k], rtol=1e-13)
+    states = package.run(q[0], qd[0], u, h=0.02, steps=5)
+    for k in range(3):
+        inputs = np.repeat(u[:, k].numpy(), 5, 0)
+        run = package.model.simulate(q[0, k].numpy(), qd[0, k].numpy(), 0.02, u=inputs, steps=20)
+        for own, expected in zip(states, (run.q, run.qd), strict=True):
+            assert np.allclose(own[:, k], expected[5::5], rtol=1e-12, atol=1e-12)
+    rounded = package.acceleration(q.float(), qd.float(), u.float())
+    assert rounded.dtype == torch.float32
+    assert torch.allclose(rounded.double(), package.acceleration(q, qd, u), rtol=1e-5, atol=1e-5)
+    with pytest.raises(ValueError, match=r"q: shape \(1,\), expected \(..., 2\)"):
+        package.acceleration([0.1], [0.2], [0.3])
+    with pytest.raises(package.model.MotionError, match="no step from q = "):
+        package.step([0.1, 0.2], [0.3, 1e200], [1.0])
+    time = torch.tensor(0.5, dtype=torch.double, requires_grad=True)
+    package.acceleration(q, qd, u, None, time).sum().backward()
+    assert time.grad == 0.0
+
+
 # --- the page -------------------------------------------------------------------------------------
 
 
@@ -416,14 +477,11 @@ def run_page(library: str, folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_page_about_casadi_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("casadi", reason="no casadi: pip install '.[casadi]'")
+@pytest.mark.parametrize("section", ["CasADi", "JAX", "PyTorch"])
+def test_page_about_exports_runs(
+    section: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    library = {"PyTorch": "torch"}.get(section, section.lower())
+    pytest.importorskip(library, reason=f"no {library}: pip install '.[{library}]'")
     monkeypatch.chdir(tmp_path)
-    run_page("CasADi", tmp_path)
-
-
-@pytest.mark.slow
-def test_page_about_jax_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("jax", reason="no jax: pip install '.[jax]'")
-    monkeypatch.chdir(tmp_path)
-    run_page("JAX", tmp_path)
+    run_page(section, tmp_path)

@@ -201,3 +201,9 @@ _export_package(
     "Write a package for JAX: accelerations and steps as functions with custom derivatives in "
     "reverse mode, for many states at once.",
 )
+_export_package(
+    "torch",
+    "Write a package for PyTorch.",
+    "Write a package for PyTorch: accelerations and steps as functions with custom derivatives, "
+    "for many states at once.",
+)
