@@ -107,6 +107,17 @@ def test_model_predictive_control_keeps_the_double_pendulum_upright() -> None:
     assert all(abs(x) < 0.05 for x in numbers(text, r"= (\S+) m, a1 = (\S+) rad, a2 = (\S+) rad"))
 
 
+@pytest.mark.slow
+def test_pole_is_swung_up_by_ilqr() -> None:
+    text = run_script("ilqr.py")
+    count, cost, force = numbers(text, r"(\d+) iterations, cost (\S+), force up to (\S+) N")
+    assert count < 150 and cost < 3.2 and force <= 9.5
+    x, theta = numbers(text, r"x = (\S+) m, theta = (\S+) rad")
+    assert abs(x) < 0.02 and abs(theta) < 0.02
+    own, without = numbers(text, r"theta = (\S+) rad, without feedback (\S+) rad")
+    assert abs(own) < 0.1 < abs(without)
+
+
 @needs_jax
 @pytest.mark.slow
 def test_policy_gradient_learns_to_balance() -> None:
