@@ -28,6 +28,7 @@ from sympy import Expr, S
 
 from eomc.derive.energies import Energies
 from eomc.derive.ldl import Pairs, Rows, Solution, Vector
+from eomc.derive.outputs import differentiate
 from eomc.derive.tape import Tape
 from eomc.model.symbols import pivot_inverse
 from eomc.model.system import System, t
@@ -445,13 +446,9 @@ def constrained_accelerations(
         Function that is applied to intermediate results. It may return a shorter expression with
         the same value.
     """
-    A = jacobian(tape, rows)
-    c = [tape.scaled(S.NegativeOne, x) for x in select_rows(tape, rows.rest, rows)]
-    D, b = regularize_mass(tape, D, b, A, c, rows.weights)
-    switched = _switched(rows)
-    tolerance = PivotTolerance(rows.drop[0], rows.pivot_limits)
-    factored = factorize(tape, D, A, tolerance, short, switched, switched)
-    a, solved_multipliers, residuals = factored.solve(b, c, short)
+    equations = _factored_equations(tape, D, b, rows, short)
+    factored, c = equations.factors, equations.c
+    a, solved_multipliers, residuals = factored.solve(equations.b, c, short)
     parts: dict[int, list[Expr]] = {}
     for row, x in zip(rows.solved, solved_multipliers, strict=True):
         for k, w in row:
@@ -466,6 +463,79 @@ def constrained_accelerations(
         rows.solved[r][0][0]: (residual, pivot) for (r, (pivot, _)), residual in switched_rows
     }
     return Solution(tape, a, order, factored.pivots, "D", multipliers, parts_of_switched)
+
+
+@dataclass(frozen=True)
+class _FactoredEquations:
+    """The equations D a - A^T lambda = b, A a = c with a regular D, and the factors of K."""
+
+    D: Rows
+    A: Rows
+    b: Sequence[Expr]
+    c: Sequence[Expr]
+    factors: KktFactors
+
+
+def _factored_equations(
+    tape: Tape,
+    D: Rows,
+    b: Sequence[Expr],
+    rows: Constraints,
+    short: Callable[[Expr], Expr] = lambda atom: atom,
+) -> _FactoredEquations:
+    """Return the equations of the accelerations and multipliers, factored."""
+    A = jacobian(tape, rows)
+    c = [tape.scaled(S.NegativeOne, x) for x in select_rows(tape, rows.rest, rows)]
+    D, b = regularize_mass(tape, D, b, A, c, rows.weights)
+    switched = _switched(rows)
+    tolerance = PivotTolerance(rows.drop[0], rows.pivot_limits)
+    factors = factorize(tape, D, A, tolerance, short, switched, switched)
+    return _FactoredEquations(D, A, b, c, factors)
+
+
+def linearize_constrained(
+    system: System, tape: Tape, D: Rows, b: Sequence[Expr], rows: Constraints
+) -> tuple[Rows, Pairs]:
+    """Return the derivatives [da/dq, da/dqd, da/du] of constrained accelerations a, and the pivots.
+
+    They follow from the residuals of the equations at constant a and lambda,
+
+        [D  A^T] [   da   ]   [db - dD a + dA^T lambda]
+        [A   0 ] [-dlambda] = [dc - dA a              ],
+
+    with the factors that gave a. The arguments are those of `constrained_accelerations`; no
+    constraint is switched by modes. Raises SceneError if the equations contain a discontinuous
+    function.
+    """
+    equations = _factored_equations(tape, D, b, rows)
+    D, A, factors = equations.D, equations.A, equations.factors
+    a, multipliers, _ = factors.solve(equations.b, equations.c, lambda atom: atom)
+    a, multipliers = (tuple(map(tape.opaque, x)) for x in (a, multipliers))
+    n, m = range(len(D)), range(len(A))
+    values = [*equations.b, *equations.c, *(x for row in (*D, *A) for x in row)]
+
+    def column(x: sympy.Symbol) -> Vector:
+        """Return da/dx."""
+        (changes,) = differentiate(system, tape, values, [{x: S.One}])
+        db, dc = changes[: len(n)], changes[len(n) : len(n) + len(m)]
+        entries = iter(changes[len(n) + len(m) :])
+        dD, dA = ([[next(entries) for _ in n] for _ in count] for count in (n, m))
+
+        def minus_product(first: Expr, row: Sequence[Expr]) -> list[Expr]:
+            products = (tape.times(y, z) for y, z in zip(row, a, strict=True))
+            return [first, *(tape.scaled(S.NegativeOne, y) for y in products)]
+
+        forces = [
+            tape.total(
+                [*minus_product(db[i], dD[i]), *(tape.times(dA[r][i], multipliers[r]) for r in m)]
+            )
+            for i in n
+        ]
+        rates = [tape.total(minus_product(dc[r], dA[r])) for r in m]
+        return factors.solve(forces, rates, lambda atom: atom)[0]
+
+    columns = [column(x) for x in (*system.q, *system.qd, *system.u)]
+    return tuple(zip(*columns, strict=True)), factors.pivots
 
 
 def _switched(rows: Constraints) -> list[int]:

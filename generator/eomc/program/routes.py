@@ -21,13 +21,13 @@ from functools import cached_property
 
 from sympy import Add, Expr, Mul, Pow, Rational, S, Symbol
 
-from eomc.derive.constraints import constrained_accelerations
+from eomc.derive.constraints import constrained_accelerations, linearize_constrained
 from eomc.derive.energies import tangent_symbols
 from eomc.derive.inverse_dynamics_derivatives import applies, linearize
 from eomc.derive.lagrange import Derivation, EquationsOfMotion
 from eomc.derive.ldl import Rows, SolveResult, solve
 from eomc.derive.link_multipliers import prefer_short_chains
-from eomc.derive.outputs import linearization
+from eomc.derive.outputs import MAX_LINEARIZATION_SIZE, linearization
 from eomc.derive.tape import Stage, Tape, split
 from eomc.model.system import System
 from eomc.program.ir import Cost, Function, evaluator, nearby
@@ -509,6 +509,20 @@ def _by_inverse_dynamics(material: RouteInputs, _: Candidate) -> Candidate | Non
     return Candidate(derived.tape, [x for row in derived.rows for x in row], derived.pivots)
 
 
+def _by_residuals(material: RouteInputs, _: Candidate) -> Candidate | None:
+    """Return the derivatives of constrained accelerations from those of their equations."""
+    derived = material.derived
+    known = [e for e in (derived.lagrange, derived.newton_euler) if e is not None]
+    e = min(known, key=lambda e: len(e.tape.live([x for row in e.D for x in row])))
+    width = 2 * len(derived.system.q) + len(derived.system.u)
+    if e.rows is None or e.rows.switched or len(e.D) < len(e.g):
+        return None
+    if width * len(e.tape.live(e.balance)) > MAX_LINEARIZATION_SIZE:
+        return None
+    rows, pivots = linearize_constrained(derived.system, e.tape, e.D, e.balance, e.rows)
+    return Candidate(e.tape, [x for row in rows for x in row], pivots)
+
+
 ROUTES: Mapping[str, Route] = {
     r.name: r
     for r in (
@@ -553,6 +567,11 @@ ROUTES: Mapping[str, Route] = {
             "tree",
             "Newton and Euler differentiated along the tree, L D L^T",
             linearization=_by_inverse_dynamics,
+        ),
+        Route(
+            "kkt",
+            "the equations with constraints differentiated, KKT matrix by L D L^T",
+            linearization=_by_residuals,
         ),
     )
 }
