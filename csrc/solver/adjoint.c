@@ -1,5 +1,5 @@
 /*
- * The discrete adjoint of a run with fixed steps of an explicit Runge-Kutta method: the derivatives of a function of
+ * The discrete adjoint of a run with fixed steps of a Runge-Kutta method: the derivatives of a function of
  * its rows with respect to its start, inputs and parameters, step by step backwards (Hager, Numer. Math. 87 (2000),
  * 247). The name x_bar stands for the derivative of that function with respect to x.
  */
@@ -25,6 +25,66 @@ typedef struct {
 #endif
 } eom_adjoint_sums;
 
+#if EOM_IMPLICIT
+/* Whether an iteration has converged: a sweep changes values by rounding, relative to their size (sums of magnitudes). */
+static int eom_sweeps_end(real change, real last, real size)
+{
+    static const real CONVERGED = 16*EOM_EPS, ROUNDING = 1000*EOM_EPS; /* relative */
+
+    return change <= CONVERGED*size || (change >= last/2 && change <= ROUNDING*size);
+}
+
+/* a = the accelerations at the stages of the step from q, qd, by fixed-point iteration. */
+static eom_status eom_method_find_stages(real *a, const real *q, const real *qd, real t, real h, const eom_model *m)
+{
+    enum { NQ = EOM_NQ, S = EOM_METHOD_STAGES, MAX_SWEEPS = 100 };
+    real r[EOM_WIDTH], v[EOM_WIDTH], qdd[EOM_WIDTH] = { 0 }, last = 0;
+
+    for (int i = 0; i < S*NQ; i++)
+        a[i] = 0;
+    for (int n = 0; n < MAX_SWEEPS; n++) {
+        real change = 0, size = 0;
+
+        for (int i = 0; i < S; i++) {
+            eom_status status;
+
+            eom_method_stage_state(r, v, a, i, S, q, qd, h);
+            status = eom_accelerate(qdd, r, v, t + eom_method_c[i]*h, m);
+            if (status)
+                return n > 0 ? EOM_NO_CONVERGENCE : status;
+            for (int k = 0; k < NQ; k++) {
+                change += eom_fabs(qdd[k] - a[NQ*i + k]);
+                size += eom_fabs(qdd[k]);
+                a[NQ*i + k] = qdd[k];
+            }
+        }
+        if (eom_sweeps_end(change, last, size))
+            return EOM_OK;
+        last = change;
+    }
+    return EOM_NO_CONVERGENCE;
+}
+#else
+/* a = the accelerations at the stages of the step from q, qd. */
+static eom_status eom_method_find_stages(real *a, const real *q, const real *qd, real t, real h, const eom_model *m)
+{
+    enum { NQ = EOM_NQ };
+    real r[EOM_WIDTH], v[EOM_WIDTH], qdd[EOM_WIDTH] = { 0 };
+
+    for (int i = 0; i < EOM_METHOD_STAGES; i++) {
+        eom_status status;
+
+        eom_method_stage_state(r, v, a, i, i, q, qd, h);
+        status = eom_accelerate(qdd, r, v, t + eom_method_c[i]*h, m);
+        if (status)
+            return status;
+        for (int k = 0; k < NQ; k++)
+            a[NQ*i + k] = qdd[k];
+    }
+    return EOM_OK;
+}
+#endif
+
 /*
  * Record n steps, from the state at the beginning of the first record on. A record has the start q, qd of a step and the
  * accelerations at its stages. The state after the steps follows the last record. first: number of the first step.
@@ -38,22 +98,15 @@ static eom_status eom_method_record_steps(real *records, long first, long n, con
 
     for (long k = 0; k < n; k++) {
         real *const q = records + RECORD*k, *const qd = q + NQ, *const a = qd + NQ, *const next = a + S*NQ;
-        real r[EOM_WIDTH], v[EOM_WIDTH], qdd[EOM_WIDTH] = { 0 };
+        eom_status status;
 
 #if EOM_INPUTS
         own.u = run->u ? run->u + EOM_NU*((first + k)/run->hold) : run->u;
         m = &own;
 #endif
-        for (int i = 0; i < S; i++) {
-            eom_status status;
-
-            eom_method_stage_state(r, v, a, i, i, q, qd, run->h);
-            status = eom_accelerate(qdd, r, v, run->t0 + (real)(first + k)*run->h + eom_method_c[i]*run->h, m);
-            if (status)
-                return status;
-            for (int l = 0; l < NQ; l++)
-                a[NQ*i + l] = qdd[l];
-        }
+        status = eom_method_find_stages(a, q, qd, run->t0 + (real)(first + k)*run->h, run->h, m);
+        if (status)
+            return status;
         eom_method_end_state(next, next + NQ, a, q, qd, run->h);
     }
     return EOM_OK;
@@ -75,31 +128,96 @@ static eom_status eom_pull_back_accelerations(real *bar, const real *qdd_bar, co
     return status;
 }
 
+/*
+ * bars = the derivatives by [q, qd, u, p] of the accelerations at each stage of a recorded step, times those of the end
+ * by them: directly, a_bars, and through the other stages, from the last to the first. Returns the status.
+ */
+#if EOM_IMPLICIT
+/* The others are those of the last sweep. change: that of bars by this sweep; size: their size, both sums of magnitudes. */
+static eom_status eom_method_pull_back_stages(real *bars, const real *a_bars, const real *record, real t, real h, const eom_model *m, real *change, real *size)
+#else
+static eom_status eom_method_pull_back_stages(real *bars, const real *a_bars, const real *record, real t, real h, const eom_model *m)
+#endif
+{
+    enum { NQ = EOM_NQ, S = EOM_METHOD_STAGES, W = EOM_VARIABLES };
+    const real *const q = record, *const qd = q + NQ, *const a = qd + NQ;
+    real a_bar[NQ], bar[W], r[NQ], v[NQ];
+
+    for (int i = S - 1; i >= 0; i--) {
+#if EOM_IMPLICIT
+        const int count = S, first = 0;
+#else
+        const int count = i, first = i + 1;
+#endif
+        eom_status status;
+
+        for (int k = 0; k < NQ; k++) {
+            a_bar[k] = a_bars[NQ*i + k];
+            for (int j = first; j < S; j++)
+                a_bar[k] += h*(h*eom_method_AA[j][i]*bars[W*j + k] + eom_method_A[j][i]*bars[W*j + NQ + k]);
+        }
+        eom_method_stage_state(r, v, a, i, count, q, qd, h);
+        status = eom_pull_back_accelerations(bar, a_bar, r, v, t + eom_method_c[i]*h, m);
+        if (status)
+            return status;
+#if EOM_IMPLICIT
+        for (int k = 0; k < 2*NQ; k++) {
+            *change += eom_fabs(bar[k] - bars[W*i + k]);
+            *size += eom_fabs(bar[k]);
+        }
+#endif
+        for (int k = 0; k < W; k++)
+            bars[W*i + k] = bar[k];
+    }
+    return EOM_OK;
+}
+
+#if EOM_IMPLICIT
+/* bars = the same for all stages of an implicit method, by fixed-point iteration. */
+static eom_status eom_method_pull_back_all_stages(real *bars, const real *a_bars, const real *record, real t, real h, const eom_model *m)
+{
+    enum { MAX_SWEEPS = 100 };
+    real last = 0;
+
+    for (int i = 0; i < EOM_METHOD_STAGES*(EOM_VARIABLES); i++)
+        bars[i] = 0;
+    for (int n = 0; n < MAX_SWEEPS; n++) {
+        real change = 0, size = 0;
+        const eom_status status = eom_method_pull_back_stages(bars, a_bars, record, t, h, m, &change, &size);
+
+        if (status)
+            return n > 0 ? EOM_NO_CONVERGENCE : status;
+        if (eom_sweeps_end(change, last, size))
+            return EOM_OK;
+        last = change;
+    }
+    return EOM_NO_CONVERGENCE;
+}
+
+#endif
 /* Replace the derivatives with respect to the end of a recorded step by those with respect to its start. */
 static eom_status eom_method_pull_back_step(const eom_adjoint_sums *to, const real *record, real t, real h, const eom_model *m)
 {
-    enum { NQ = EOM_NQ, S = EOM_METHOD_STAGES };
-    const real *const q = record, *const qd = q + NQ, *const a = qd + NQ;
-    real a_bar[S*NQ], bar[EOM_VARIABLES], r[NQ], v[NQ];
+    enum { NQ = EOM_NQ, S = EOM_METHOD_STAGES, W = EOM_VARIABLES };
+    real a_bars[S*NQ], bars[S*(W)];
+    eom_status status;
 
     for (int k = 0; k < NQ; k++) {
         for (int i = 0; i < S; i++)
-            a_bar[NQ*i + k] = h*(h*eom_method_bA[i]*to->q[k] + eom_method_b[i]*to->qd[k]);
+            a_bars[NQ*i + k] = h*(h*eom_method_bA[i]*to->q[k] + eom_method_b[i]*to->qd[k]);
         to->qd[k] += h*to->q[k];
     }
-    for (int i = S - 1; i >= 0; i--) {
-        const real c = eom_method_c[i], *const A = eom_method_A[i], *const AA = eom_method_AA[i];
-        eom_status status;
+#if EOM_IMPLICIT
+    status = eom_method_pull_back_all_stages(bars, a_bars, record, t, h, m);
+#else
+    status = eom_method_pull_back_stages(bars, a_bars, record, t, h, m);
+#endif
+    for (int i = 0; i < S && status == EOM_OK; i++) {
+        const real *const bar = bars + W*i;
 
-        eom_method_stage_state(r, v, a, i, i, q, qd, h);
-        status = eom_pull_back_accelerations(bar, a_bar + NQ*i, r, v, t + c*h, m);
-        if (status)
-            return status;
         for (int k = 0; k < NQ; k++) {
             to->q[k] += bar[k];
-            to->qd[k] += bar[NQ + k] + h*c*bar[k];
-            for (int j = 0; j < i; j++)
-                a_bar[NQ*j + k] += h*(h*AA[j]*bar[k] + A[j]*bar[NQ + k]);
+            to->qd[k] += bar[NQ + k] + h*eom_method_c[i]*bar[k];
         }
 #if EOM_INPUTS
         for (int k = 0; k < EOM_NU; k++)
@@ -107,10 +225,10 @@ static eom_status eom_method_pull_back_step(const eom_adjoint_sums *to, const re
 #endif
 #if EOM_PARAMETERS
         for (int k = 0; k < EOM_PARAMETERS; k++)
-            to->p[k] += bar[EOM_VARIABLES - EOM_PARAMETERS + k];
+            to->p[k] += bar[W - EOM_PARAMETERS + k];
 #endif
     }
-    return EOM_OK;
+    return status;
 }
 
 /* Replace the derivatives with respect to the end of n recorded steps by those with respect to their start. */

@@ -148,6 +148,7 @@ CASES = {
     "derivative of gauss6 with constraints": derivative("gauss6", "CONSTRAINTS", "NEWTON"),
     "adjoint of rk4": Case("test_adjoint.c", METHODS["rk4"]),
     "adjoint of dp8 with inputs": Case("test_adjoint.c", METHODS["dp8"], ("INPUTS", "PARAMETERS")),
+    "adjoint of gauss6": Case("test_adjoint.c", METHODS["gauss6"], ("IMPLICIT", "INPUTS")),
     "adaptive": Case("test_adaptive.c", None, ("ADAPTIVE",)),
     "kinks": Case("test_adaptive.c", None, ("ADAPTIVE", "KINKS")),
     "constraints": Case("test_adaptive.c", None, ("ADAPTIVE", "CONSTRAINTS")),

@@ -134,7 +134,7 @@ def pull_back(
     See `Trajectory.vjp`. request: that of the run, without a function of inputs.
     """
     info, c, name = run.model.info, run.model.c, f"{request.method}_adjoint"
-    if reason := _refusal(run, request, hasattr(c.lib, name)):
+    if reason := _refusal(run, request):
         raise ValueError(f"vjp: {reason}")
     n, m, u = info.nq, info.nu, request.u
     bars = [_seeds(x, of, run.q) for x, of in ((q_bar, "q_bar"), (qd_bar, "qd_bar"))]
@@ -158,8 +158,9 @@ def pull_back(
         request.steps, request.every, c.pointer(u), hold, c.pointer(p), c.pointer(work),
     )  # fmt: skip
     if status:
-        what = "" if STATUS[status] == "singular" else "a derivative along the run is not finite"
-        refuse(STATUS[status], run.q[0], run.qd[0], 0, what and f"{what}, in the run from there")
+        infinite = "a derivative along the run from there is not finite"
+        what = infinite if STATUS[status] == "not finite" else ""
+        refuse(STATUS[status], run.q[0], run.qd[0], 0, what)
     return RunGradient(q0_bar, qd0_bar, u_bar if u is None else u_bar.reshape(u.shape), p_bar)
 
 
@@ -182,7 +183,7 @@ def _at_rows(values: Array, indices: Array, rows: Array) -> Array:
     return full
 
 
-def _refusal(run: Any, request: Request, has_function: bool) -> str:
+def _refusal(run: Any, request: Request) -> str:
     """Return why a run has no adjoint, or "" if it has one."""
     info, lib = run.model.info, run.model.c.lib
     if not hasattr(lib, "acceleration_vjp"):
@@ -191,9 +192,7 @@ def _refusal(run: Any, request: Request, has_function: bool) -> str:
     if info.constraints.names:
         return "runs with constraints have no adjoint"
     if not request.h:
-        return "adaptive steps have no adjoint: give h= and an explicit method"
-    if not has_function:
-        return f"'{request.method}' has no adjoint: run with an explicit method, such as 'rk4'"
+        return "adaptive steps have no adjoint: give h="
     if request.times is not None:
         return "rows at requested times have no adjoint: give every= instead of times="
     if run.status != "ok":

@@ -336,11 +336,12 @@ class Trajectory(Columns):
         Raises
         ------
         MotionError
-            If a derivative is not finite.
+            If a derivative is not finite, or if the fixed-point iterations of an implicit method do
+            not converge, as in stiff motions.
         ValueError
             If the module was built without Jacobian products, or if the run has no adjoint: that
-            of adaptive steps, of an implicit method, with rows at requested times, with constraints
-            or with events that occurred.
+            of adaptive steps, with rows at requested times, with constraints or with events that
+            occurred.
 
         Notes
         -----

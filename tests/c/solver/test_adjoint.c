@@ -14,11 +14,19 @@
 
 enum { EOM_NU = 1, EOM_VARIABLES = 2*EOM_NQ + EOM_INPUTS + EOM_PARAMETERS };
 
+#if EOM_IMPLICIT
+#define eom_method_c eom_gauss_c
+#define eom_method_A eom_gauss_A
+#define eom_method_AA eom_gauss_AA
+#define eom_method_b eom_gauss_b
+#define eom_method_bA eom_gauss_bA
+#else
 #define eom_method_c eom_explicit_c
 #define eom_method_A eom_explicit_A
 #define eom_method_AA eom_explicit_AA
 #define eom_method_b eom_explicit_b
 #define eom_method_bA eom_explicit_bA
+#endif
 
 static eom_status eom_evaluate_acceleration_vjp(real *bar, const real *q, const real *qd, const real *qdd_bar, real t, const eom_model *m)
 {
@@ -38,13 +46,30 @@ static eom_status eom_evaluate_acceleration_vjp(real *bar, const real *q, const 
 
 #include "state.c"
 #include "step_end.c"
+#if EOM_IMPLICIT
+#include "linear.c"
+#include "differences.c"
+#include "gauss_fixed.c"
+#else
 #include "explicit.c"
+#endif
 #include "adjoint.c"
 
 enum { STEPS = 38, HOLD = 4, MAX_ROWS = STEPS + 1, INPUT_ROWS = (STEPS + HOLD - 1)/HOLD };
 
 static const real T0 = (real)0.1, H = (real)0.05;
 static real q_rows[EOM_NQ*MAX_ROWS], qd_rows[EOM_NQ*MAX_ROWS], q_bars[EOM_NQ*MAX_ROWS], qd_bars[EOM_NQ*MAX_ROWS];
+
+static eom_status advance(real *q, real *qd, real t, const eom_model *m)
+{
+#if EOM_IMPLICIT
+    long evaluations = 0;
+
+    return eom_gauss_advance(q, qd, t, H, m, &evaluations);
+#else
+    return eom_explicit_advance(q, qd, t, H, m);
+#endif
+}
 
 /* The rows of a run from x with inputs u; returns the sum of their products with q_bars, qd_bars. */
 static real run_steps(const real *x, const real *u, long every, real damping)
@@ -64,7 +89,7 @@ static real run_steps(const real *x, const real *u, long every, real damping)
         }
         m.u = EOM_INPUTS ? u + n/HOLD : NULL;
         if (n < STEPS)
-            CHECK(eom_explicit_advance(q, qd, T0 + (real)n*H, H, &m) == EOM_OK, n);
+            CHECK(advance(q, qd, T0 + (real)n*H, &m) == EOM_OK, n);
     }
     return sum;
 }

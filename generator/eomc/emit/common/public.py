@@ -15,7 +15,6 @@ from eomc.emit.common.c_function import (
     return_statement,
 )
 from eomc.emit.common.c_names import Target
-from eomc.integrators.tableaux import Method
 from eomc.program.ir import Function
 from eomc.program.program import TIME
 
@@ -379,10 +378,10 @@ class Public:
             f"{method}_derivative", *out, *self.arguments(*STATE, "t", "h", "u", "p")
         )
 
-    def has_adjoint(self, method: Method) -> bool:
-        """Return True if there is a function for the adjoint of runs by a method."""
-        constrained = bool(self.target.system.constraints)
-        return self.has("acceleration_vjp") and not (method.implicit or constrained)
+    @property
+    def has_adjoints(self) -> bool:
+        """Whether there are functions for the adjoint of runs by fixed steps."""
+        return self.has("acceleration_vjp") and not self.target.system.constraints
 
     def adjoint(self, method: str) -> CFunction:
         """Return the prototype of the C function for the adjoint of runs by a method.

@@ -500,7 +500,7 @@ def step_derivatives(model: SolverModel) -> Iterator[str]:
 
 
 def run_adjoints(model: SolverModel) -> Iterator[str]:
-    """Yield C definitions of the adjoint of runs by each method that has one."""
+    """Yield C definitions of the adjoint of runs by each method."""
     functions, target = model.functions, model.functions.target
     features = {
         "INPUTS": bool(target.system.inputs),
@@ -512,13 +512,13 @@ def run_adjoints(model: SolverModel) -> Iterator[str]:
         "EOM_VARIABLES": c_array_size(target, "x"),
         "EOM_PARAMETERS": str(len(target.system.parameters)),
     }
-    for method in filter(functions.public.has_adjoint, functions.methods):
-        tables = (f"eom_explicit_{name}" for name in ("c", "A", "AA", "b", "bA"))
+    for method in functions.methods if functions.public.has_adjoints else ():
+        tables = (f"eom_{method_kind(method)}_{name}" for name in ("c", "A", "AA", "b", "bA"))
         yield from amalgamate(
             ("state.c", "step_end.c", "adjoint.c"),
             ["eom_method_pull_back_run", *tables],
             library_names(model, method, **exact),
-            features,
+            features | {"IMPLICIT": method.implicit},
             tableau_tables(functions, method),
         )
         yield show("c/adjoint.c", functions, method=method, model=model)
