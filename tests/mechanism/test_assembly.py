@@ -84,8 +84,8 @@ def test_bricard_drops_the_row_that_leaves_the_best_conditioned_four() -> None:
     assert [c.redundant for c in system.constraints] == [False] * 4 + [True]
     assert system.closure is not None
     assert system.closure.ranks == (
-        "rank 4 of 5: row row_4 is redundant; the forces in row_0, row_1, row_2, row_3, row_4 are "
-        "not unique"
+        "rank 4 of 5: equation row_4 is redundant; "
+        "the forces in row_0, row_1, row_2, row_3, row_4 are not unique"
     )
     assert any(system.closure.ranks in str(w) for w in system.warnings)
 

@@ -352,7 +352,9 @@ def test_long_chain_has_all_its_degrees_of_freedom() -> None:
 
 def test_scene_without_bodies_is_reported() -> None:
     text = 'eomc = 1\nname = "s_1"\n[coordinates]\nx = {}\n[energy]\nkinetic = "x_dot**2"\n'
-    with pytest.raises(EomcError, match=r"no \[\[body\]\], .* each coordinate is a freedom, x$"):
+    with pytest.raises(
+        EomcError, match=r"no \[\[body\]\], .* each coordinate is a degree of freedom, x$"
+    ):
         mobility.compute_mobility(parse(text))
 
 
@@ -364,7 +366,7 @@ def test_dof_command_prints_the_table(tmp_path: Path) -> None:
         encoding="utf-8",
     )
     result = CliRunner().invoke(main, ["dof", str(path)])
-    assert result.exit_code == 0 and "arm: 1 freedom in space" in result.output
+    assert result.exit_code == 0 and "arm: 1 degree of freedom in space" in result.output
     reported = json.loads(CliRunner().invoke(main, ["dof", str(path), "--json"]).output)
     assert (reported["M"], reported["rank"], reported["joints"]) == (1, 1, {"revolute": 1})
 
@@ -425,8 +427,8 @@ def test_dof_prints_rank_and_assembled_initial_state(
     monkeypatch.setattr(ranks, "closest_singularity", lambda _: closest)  # no second search
     shown = CliRunner().invoke(main, ["dof", str(file)]).output
     assert str(closest) in shown
-    assert "2 rows of constraints on 3 coordinates, rank 2 of 2" in shown
-    assert "assembled start: q1 = 1.04719755, q2 = " in shown
+    assert "2 constraint equations on 3 coordinates, rank 2 of 2" in shown
+    assert "assembled initial state: q1 = 1.04719755, q2 = " in shown
 
 
 def test_dof_of_a_scene_without_bodies_is_refused(tmp_path: Path) -> None:
@@ -437,7 +439,9 @@ def test_dof_of_a_scene_without_bodies_is_refused(tmp_path: Path) -> None:
         '[energy]\nkinetic = "x_dot**2 + y_dot**2"\n[constraints]\nrod = "x**2 + y**2 - 1"\n'
     )
     shown = CliRunner().invoke(main, ["dof", str(file)]).output
-    assert shown.startswith("1 row of constraints on 2 coordinates, rank 1 of 1\n  1 freedom left")
+    assert shown.startswith(
+        "1 constraint equation on 2 coordinates, rank 1 of 1\n  remaining: 1 degree of freedom"
+    )
 
 
 def warnings(text):
@@ -475,5 +479,5 @@ def test_loop_with_a_wrong_rotation_in_every_position_is_refused():
         'joint = "revolute"\naxis = [[0, 0, 1], [0, 0, -1]]',
         'joint = "weld"\nrotation = [["x", "pi"]]',
     ):
-        with pytest.raises(SceneError, match=r"loop\.pin: can't close as is meant"):
+        with pytest.raises(SceneError, match=r"loop\.pin: can't close as described"):
             assembled(from_scene(parse(text + rest)))

@@ -46,7 +46,7 @@ def flat() -> ClosestSingularity | None:
 def test_flat_parallelogram_is_singular(flat: ClosestSingularity | None) -> None:
     """One of its rows has no gradient there; each row by itself would look regular."""
     assert flat == ClosestSingularity(0.0, {"A": 0.0, "B": 0.0, "C": 0.0})
-    assert str(flat) == "  sigma_min/sigma_max 0 at the worst on its way: A = 0, B = 0, C = 0"
+    assert str(flat) == "  smallest sigma_min/sigma_max along the motion 0: A = 0, B = 0, C = 0"
 
 
 def test_four_bar_agrees_with_a_grid_of_crank_angles(

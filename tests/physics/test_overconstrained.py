@@ -143,7 +143,7 @@ def test_dependent_constraints_are_replaced_by_sums() -> None:
     closure = read(BENNETT).closure
     assert closure is not None and closure.rank == 2 and closure.freedoms == 1
     assert closure.redundant == () and len(closure.sums) == 2 and len(closure.shared) == 5
-    assert "2 sums of them stand for these" in closure.ranks
+    assert "solved as 2 linear combinations" in closure.ranks
 
 
 @pytest.mark.slow

@@ -376,7 +376,7 @@ def test_constraints_that_contradict_each_other_later_are_reported(tmp_path: Pat
     (tmp_path / "later.toml").write_text(LATER, encoding="utf-8")
     scene_system = eomc.read(tmp_path / "later.toml")
     messages = " ".join(map(str, scene_system.warnings))
-    assert "no position obeys the rows a little later" in messages
+    assert "no position satisfies the constraints shortly after the start" in messages
     module = eomc.load(scene_system, tmp_path / "build")
     with pytest.warns(RuntimeWarning, match="constraints: they contradict one another"):
         assert module.simulate().status == "locked"

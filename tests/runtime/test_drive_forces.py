@@ -95,7 +95,9 @@ def test_without_constraints_drive_forces_equal_inverse_dynamics(modules: Module
     tau, multipliers = m.drive_forces(q, qd, [1.0, 2.0])
     assert multipliers.shape == (0,)
     np.testing.assert_allclose(tau, m.inverse_dynamics(q, qd, [1.0, 2.0]), rtol=1e-13)
-    with pytest.raises(ValueError, match=r"forces along x can't give .*: name others.* 2 freedoms"):
+    with pytest.raises(
+        ValueError, match=r"forces along x can't give .*: name others.* 2 degrees of freedom"
+    ):
         m.drive_forces(q, qd, [1.0, 2.0], ["x"])
     with pytest.raises(m.MotionError, match=r"at .*a force .* is not finite there"):
         m.drive_forces([1e200, 0.4], qd, [1.0, 2.0])

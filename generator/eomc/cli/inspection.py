@@ -55,7 +55,7 @@ def dof_command(scene: Path, as_json: bool) -> None:
             counted["constraints"]["nearest_singular"] = vars(closest_singularity)
             lines.append(str(closest_singularity))
         start = (f"{c.name} = {c.start:.9g}" for c in system.coordinates)
-        lines.append(f"  assembled start: {', '.join(start)}")
+        lines.append(f"  assembled initial state: {', '.join(start)}")
     say(json.dumps(counted, indent=1) if as_json else "\n".join(lines))
 
 

@@ -292,32 +292,32 @@ def _remarks(manifold: Manifold, start: ConsistentStart, constraint_ranks: Ranks
     rows, rank = len(manifold.rows), constraint_ranks.rank
     if start.may_have_changed_branch:
         yield (
-            "small ways from the guess lead to no position that the rows leave; longer ones led to "
-            "this start, which may lie on another branch than was meant: look at it"
+            "no position near the guess satisfies the constraints; this initial state is farther "
+            "away and may be on another branch than intended: check it"
         )
     if constraint_ranks.rank == len(manifold.system.q):
         yield (
-            "no freedom is left: the rows alone decide the motion in time"
+            "no degree of freedom remains: the constraints determine the motion in time"
             if manifold.timed
-            else "no freedom is left, and nothing moves: a structure under its load"
+            else "no degree of freedom remains, and nothing moves: a structure"
         )
     if (
         manifold.timed
         and constraint_ranks.latest <= MIN_SOLVABLE_TIME * manifold.system.run.duration
     ):
         yield (
-            "no position obeys the rows a little later: they contradict one another as time goes "
-            "on, or the start is where the motion ends"
+            "no position satisfies the constraints shortly after the start: they contradict each "
+            "other as time increases, or the motion ends at the start"
         )
     elif not constraint_ranks.good:
         yield (
-            f"rank {rank} of {rows}, but no {rank} rows are far from singular at every "
-            "position: all are kept, and where a row depends on the others it is dropped"
+            f"rank {rank} of {rows}, but no {rank} equations are far from singular at every "
+            "position: all are used, and an equation that depends on the others is left out there"
         )
     if constraint_ranks.sigma[0] == 0:
         yield (
-            "the start is a singular position: rows depend on each other there, and the motion may "
-            "go on in more ways than one"
+            "the start is a singular position: equations depend on each other there, and the "
+            "motion may have several continuations"
         )
 
 
@@ -327,8 +327,8 @@ def _refuse_wrong_rotations(system: System) -> None:
     problems = [
         system.problem(
             f"loop.{name}",
-            "can't close as is meant: wherever its bodies move, the second frame stands in another "
-            "rotation, such as half a turn off. Reverse an axis, or correct rotation",
+            "can't close as described: in every position the second frame has another orientation, "
+            "for example rotated by half a turn. Reverse an axis, or correct rotation",
         )
         for name in find_wrong_rotations(system)(start, 0.0, {})
     ]
@@ -345,7 +345,7 @@ def _warnings(
         yield system.problem("constraints", closure.ranks, severity="warning")
     for remark in closure.remarks:
         timely = manifold.timed and constraint_ranks.rank == len(system.q)
-        severity = "note" if timely and remark.startswith("no freedom") else "warning"
+        severity = "note" if timely and remark.startswith("no degree of freedom") else "warning"
         yield system.problem("constraints", remark, severity=severity)
     moves = [*closure.moves, *closure.rate_moves]
     if moves:

@@ -89,15 +89,15 @@ class Mobility:
         total += sum(n * _closure_freedoms(k, d) for k, n in self.loops.items())
         rows = f" - {self.constraints}" if self.constraints else ""
         where = "in the plane" if d == 3 else "in space"
-        where += ", by the count" if loops or rows else ""
+        where += ", by the mobility formula" if loops or rows else ""
         lines = [
-            f"{self.scene}: {self.M} {plural('freedom', self.M)} {where}",
-            f"  N = {self.bodies + 1} links, the world among them",
+            f"{self.scene}: {self.M} {plural('degree', self.M)} of freedom {where}",
+            f"  N = {self.bodies + 1} links, including the world",
             f"  j = {j} joints: {', '.join(kinds)}",
             f"  M = d(N - 1 - j) + sum f{' - constraints' if rows else ''} = "
             f"{d}({self.bodies + 1} - 1 - {j}) + {total}{rows} = {self.M}",
-            f"  {self.coordinates} {plural('coordinate', self.coordinates)}, {self.rank} of them "
-            "independent in how they move the bodies",
+            f"  {self.coordinates} {plural('coordinate', self.coordinates)}, of which {self.rank} "
+            f"{'moves' if self.rank == 1 else 'move'} the bodies independently",
             *(f"  - {remark}" for remark in self.remarks),
         ]
         return "\n".join(lines)
@@ -122,7 +122,7 @@ def compute_mobility(scene: Scene) -> Mobility:
         names = [c.name for c in scene.coordinates]
         raise EomcError(
             f"{scene.file}: there is no [[body]], [[loop]] or [constraints] to count from: "
-            f"each coordinate is a freedom, {listed(names)}"
+            f"each coordinate is a degree of freedom, {listed(names)}"
         )
     d = 3 if assembly.plane else 6
     placed = [body for body in assembly.bodies if not body.joint]
@@ -196,8 +196,9 @@ def _report_bodies_by_formulas(
 ) -> Iterator[str]:
     if placed:
         yield (
-            f"{listed([b.name for b in placed])}: M counts {d} freedoms for each body that is "
-            f"placed by formulas; the formulas fix {M - rank} of the {M}, which leaves {rank}"
+            f"{listed([b.name for b in placed])}: M counts {d} degrees of freedom for each body "
+            f"that is placed by formulas; the formulas fix {M - rank} of the {M}, "
+            f"which leaves {rank}"
         )
 
 

@@ -427,7 +427,7 @@ class ClosestSingularity:
 
     def __str__(self) -> str:
         where = ", ".join(f"{name} = {x:.6g}" for name, x in self.q.items())
-        return f"  sigma_min/sigma_max {self.sigma:.3g} at the worst on its way: {where}"
+        return f"  smallest sigma_min/sigma_max along the motion {self.sigma:.3g}: {where}"
 
 
 def closest_singularity(system: System) -> ClosestSingularity | None:

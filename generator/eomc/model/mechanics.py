@@ -119,13 +119,12 @@ class ConstraintSummary:
         text = f"rank {self.rank} of {len(self.rows)}"
         if self.redundant:
             text += (
-                f": {plural('row', len(self.redundant))} {listed(self.redundant)} "
+                f": {plural('equation', len(self.redundant))} {listed(self.redundant)} "
                 f"{'is' if len(self.redundant) == 1 else 'are'} redundant"
             )
         if self.sums:
-            template = "; {} of others" if self.redundant else ": {} of them"
-            text += template.format(f"{len(self.sums)} {plural('sum', len(self.sums))}")
-            text += " stand for these"
+            text += "; the others are" if self.redundant else ":"
+            text += f" solved as {len(self.sums)} linear {plural('combination', len(self.sums))}"
         if self.shared:
             start = "; the" if self.redundant or self.sums else ": the"
             text += f"{start} forces in {listed(self.shared)} are not unique"
@@ -135,13 +134,13 @@ class ConstraintSummary:
         """Return the summary as text of several lines for the terminal."""
         n = len(self.rows)
         lines = [
-            f"{n} {plural('row', n)} of constraints on {self.coordinates} "
+            f"{n} constraint {plural('equation', n)} on {self.coordinates} "
             f"{plural('coordinate', self.coordinates)}, {self.ranks}",
-            f"  {self.freedoms} {plural('freedom', self.freedoms)} left",
+            f"  remaining: {self.freedoms} {plural('degree', self.freedoms)} of freedom",
             f"  sigma_min/sigma_max {self.start_sigma:.3g} at the start, "
-            f"{self.least_sigma:.3g} at the worst of {self.positions} positions",
-            *(f"  start: {move}" for move in self.moves),
-            *(f"  rate: {move}" for move in self.rate_moves),
+            f"at least {self.least_sigma:.3g} at {self.positions} positions",
+            *(f"  changed position: {move}" for move in self.moves),
+            *(f"  changed velocity: {move}" for move in self.rate_moves),
             *(f"  - {remark}" for remark in self.remarks),
         ]
         return "\n".join(lines)

@@ -108,7 +108,7 @@ def drive_forces(model: CompiledModel, which: list[int], motion: Motion) -> tupl
         where = state_text(motion.q, motion.qd)
         raise ValueError(
             f"drives: forces along {names} can't give this motion at {where}: name"
-            f" others, or more; there are {len(right)} freedoms"
+            f" others, or more; there are {len(right)} degrees of freedom"
         )
     multipliers = np.zeros(len(rows.names))
     sizes = np.maximum(np.linalg.norm(A, axis=1), np.finfo(float).tiny)
