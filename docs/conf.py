@@ -14,9 +14,13 @@ copyright = "the eomc authors"
 version = release = eomc.__version__
 
 # `site` is the folder of our own extension: links, scene keys, gallery, C functions, formulas
-extensions = ["myst_parser", "sphinx.ext.autodoc", "numpydoc", "sphinx_click", "eomc_site"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "numpydoc", "sphinx_click", "eomc_site"]
 root_doc = "README"
 exclude_patterns = ["examples", "site", "reference/*.toml"]
+nb_execution_mode = "force"  # notebooks are stored without outputs
+nb_execution_in_temp = True
+nb_execution_raise_on_error = True
+nb_execution_timeout = 300
 myst_heading_anchors = 4  # the anchors that code-hosting sites give to headings
 myst_enable_extensions = ["dollarmath"]
 smartquotes = False  # dashes of options stay as they are typed

@@ -150,6 +150,9 @@ SETUPS: dict[str, Setup] = {
         "motor.equilibrium": lambda: {"motor": load(scene_of_page("scenes.md", "charge_dot"))},
         "closed=True": _discrete,
         "acceleration_vjp": _vectors,
+        "run.vjp": lambda: {
+            "cartpole": load("cartpole_driven", linearize='"products"'), "u": np.zeros((200, 1))
+        },
         "arm.discretize": _discrete,
         "solve_discrete_are": _balance,
         "u=actions": _balance,

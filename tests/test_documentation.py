@@ -88,7 +88,7 @@ def test_equations_of_a_scene_are_in_the_gallery(pages: ModuleType, tmp_path: Pa
 
 @pytest.mark.slow
 def test_site_is_built_without_warnings(tmp_path: Path) -> None:
-    for package in ("sphinx", "myst_parser", "numpydoc", "pydata_sphinx_theme", "sphinx_click"):
+    for package in ("sphinx", "myst_nb", "numpydoc", "pydata_sphinx_theme", "sphinx_click"):
         pytest.importorskip(package, reason=f"{package} is not installed: pip install '.[docs]'")
     command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html"]
     process = subprocess.run(

@@ -41,3 +41,22 @@ def test_pages_are_followed_block_by_block(tmp_path: Path) -> None:
     assert block.reason == "needs a robot"
     with pytest.raises(AssertionError):
         follow("```sh\nfalse\n```\n", tmp_path)
+
+
+@pytest.mark.slow
+def test_notebook_runs_and_displays_equations_plots_and_animation(tmp_path: Path) -> None:
+    nbformat = pytest.importorskip("nbformat", reason="nbformat is not installed")
+    nbclient = pytest.importorskip("nbclient", reason="nbclient is not installed")
+    pytest.importorskip("ipykernel", reason="ipykernel is not installed")
+    pytest.importorskip("matplotlib")
+    notebook = nbformat.read(ROOT / "docs" / "tutorials" / "notebook.ipynb", 4)
+    assert not any(cell.get("outputs") for cell in notebook.cells)
+    resources = {"metadata": {"path": str(tmp_path)}}
+    nbclient.NotebookClient(notebook, timeout=300, resources=resources).execute()
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    data = {cell.source: output.get("data", {}) for cell in cells for output in cell.outputs}
+    (equations,) = (each for source, each in data.items() if source.endswith("\nequations"))
+    assert r"\ddot{r}" in equations["text/latex"]
+    (plot,) = (each for source, each in data.items() if "run.plot" in source)
+    assert plot["image/png"]
+    assert "<iframe" in data["run.animate()"]["text/html"]

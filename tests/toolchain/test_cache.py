@@ -137,10 +137,12 @@ def test_key_depends_on_scene_flags_compiler_and_generator(
     cache.generator_digest.cache_clear()
     try:
         assert not is_new_key()  # an exact copy
+        version = resources.generator_version()  # in the header of generated files
         with (generator / "derive" / "tape.py").open("a") as file:
             file.write("\n")
         cache.generator_digest.cache_clear()
         assert is_new_key()
+        assert resources.generator_version() != version
     finally:
         cache.generator_digest.cache_clear()
 

@@ -24,7 +24,7 @@ from eomc.base import resources
 from eomc.cli.main import main
 from eomc.toolchain import archives
 
-NAME = "cartpole-0.1.0+sceneddc4d1636089-cp311-abi3-"
+NAME = "cartpole-0.2.0.dev0+sceneddc4d1636089-cp311-abi3-"
 
 
 def test_no_module_file_has_a_name_that_wheels_write() -> None:

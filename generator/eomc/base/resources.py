@@ -5,10 +5,12 @@ The files are inside the package, or above it in a clone of the repository.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 
-__version__ = "0.1.0"  # the only place
+__version__ = "0.2.0.dev0"  # the only place
 
 PACKAGE = Path(__file__).resolve().parent.parent
 
@@ -61,3 +63,20 @@ def parts() -> Iterator[tuple[str, Path]]:
     ):
         for file in sorted(root.rglob("*" + suffix)):
             yield f"{kind}/{file.relative_to(root).as_posix()}", file
+
+
+@lru_cache(maxsize=1)
+def generator_digest() -> str:
+    """Return the SHA-256, in hexadecimal, of the version and the source files of eomc."""
+    total = hashlib.sha256(__version__.encode())
+    for name, file in parts():
+        total.update(name.encode() + file.read_bytes())
+    return total.hexdigest()
+
+
+def generator_version() -> str:
+    """Return the version with a digest of the source files, such as "0.2.0.dev0+1f0c9a3e".
+
+    It tells two generators apart between releases, and is the same wherever the files are.
+    """
+    return f"{__version__}+{generator_digest()[:8]}"

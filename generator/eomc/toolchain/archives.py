@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 from eomc.base import texts
 from eomc.base.errors import EomcError, NoCompilerError
-from eomc.base.resources import __version__
+from eomc.base.resources import __version__, generator_version
 from eomc.emit.common.templates import show
 from eomc.emit.package import Form
 from eomc.emit.render import Sources
@@ -119,7 +119,7 @@ def write_wheel(sources: Sources, scene: bytes, digest: str, title: str, folder:
             files[library] = (build_folder / library).read_bytes()
             forms.append(Form(g.name, module, g.needs))
     files[f"{COMPILED}.py"] = show(
-        "python/compiled.py", prefix=name, version=__version__, forms=forms
+        "python/compiled.py", prefix=name, version=generator_version(), forms=forms
     ).encode()
     version = f"{__version__}+scene{digest[:12]}"
     tag = f"{python}-{abi}-{_platform(files)}"

@@ -25,14 +25,12 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from eomc.base import resources
 from eomc.base.errors import EomcError, FolderError
-from eomc.base.resources import __version__
+from eomc.base.resources import __version__, generator_digest
 from eomc.runtime.atomic_write import atomic_write
 from eomc.toolchain.compiler import (
     MANY_OPERATIONS,
@@ -76,15 +74,6 @@ class Built:
 
 class ReplacedError(EomcError):
     """Error: another build replaced the compiled module on disk before it was loaded."""
-
-
-@lru_cache(maxsize=1)
-def generator_digest() -> str:
-    """Return the SHA-256, in hexadecimal, of the version and the source files of eomc."""
-    total = hashlib.sha256(__version__.encode())
-    for name, file in resources.parts():
-        total.update(name.encode() + file.read_bytes())
-    return total.hexdigest()
 
 
 def key(scene_digest: str, form: str = "fast") -> str:
