@@ -9,6 +9,9 @@ typedef struct {
     real g[EOM_SAMPLES], c[EOM_SAMPLES]; /* values at the Chebyshev nodes, and their series */
     real largest, change; /* largest magnitude; largest change between nodes */
     int is_far; /* whether its values are so far from zero that there is no root */
+#if EOM_JUMPS
+    int is_driven; /* whether it is driven through a contact, visibly after `from` */
+#endif
     real from; /* roots before this fraction z are ignored */
     real high, slope; /* end of the interval of the last root; derivative by z there */
 #if EOM_INITIAL_EVENTS
@@ -60,15 +63,45 @@ static real eom_event_rounding(int k, const real *q, const real *qd, real t, con
     return most;
 }
 
+#if EOM_ADAPTIVE
+/* Event function k at the fraction z of the part of the last step, by the interpolant. */
+#else
+/* Event function k at the fraction z of the last step, by the interpolant. */
+#endif
+static real eom_evaluate_event(int k, real z, const eom_run_state *s, const eom_model *m)
+{
+    real q[EOM_NQ], qd[EOM_NQ], value[EOM_NE];
+#if EOM_ADAPTIVE
+    const real of_step = s->part_start + z*s->part_width;
+
+    eom_interpolate(q, qd, s, of_step);
+    eom_event_functions(value, q, qd, s->t0 + of_step*s->size, m);
+#else
+
+    eom_interpolate(q, qd, s, z);
+    eom_event_functions(value, q, qd, s->t0 + z*s->size, m);
+#endif
+    return value[k] - s->event[k].offset;
+}
+
+#if EOM_JUMPS
+/*
+ * The sign that event function k has after the start of the step: its own sign there if it is not zero. Otherwise that of
+ * its first value above rounding errors at the fractions 5e-7*4^n, since a function that leaves zero may return before the
+ * first node; or that at the end of the step. 0, and e->is_driven: a jump left it at zero without a rate, and
+ * accelerations drive it on.
+ */
+static int eom_leaving_sign(int k, eom_event_samples *e, const eom_run_state *s, const eom_model *m)
+#else
 /*
  * The sign that event function k has after the start of the step: its own sign there if it is not zero. Otherwise that of
  * its first value above rounding errors at the fractions 5e-7*4^n, since a function that leaves zero may return before the
  * first node; or that at the end of the step.
  */
 static int eom_leaving_sign(int k, const eom_event_samples *e, const eom_run_state *s, const eom_model *m)
+#endif
 {
-    static const real NOISE = 8; /* multiple of a rounding error */
-    const real rounding = NOISE*(eom_fabs(e->g[0]) + eom_event_rounding(k, s->q0, s->qd0, s->t0, m));
+    const real rounding = 8*(eom_fabs(e->g[0]) + eom_event_rounding(k, s->q0, s->qd0, s->t0, m));
 
 #if EOM_INITIAL_EVENTS
     if (eom_above[k])
@@ -77,95 +110,123 @@ static int eom_leaving_sign(int k, const eom_event_samples *e, const eom_run_sta
     if (s->event[k].offset == 0 && eom_fabs(e->g[0]) > EOM_CLOSE*e->largest)
         return e->g[0] > 0 ? 1 : -1;
     for (real z = (real)5e-7; z < 1; z *= 4) {
-        real q[EOM_NQ], qd[EOM_NQ], value[EOM_NE];
-#if EOM_ADAPTIVE
-        const real of_step = s->part_start + z*s->part_width;
+        const real value = eom_evaluate_event(k, z, s, m);
 
-        eom_interpolate(q, qd, s, of_step);
-        eom_event_functions(value, q, qd, s->t0 + of_step*s->size, m);
-#else
+#if EOM_JUMPS
+        if (eom_fabs(value) > rounding) {
+            const real g4 = eom_evaluate_event(k, 4*z, s, m), g16 = eom_evaluate_event(k, 16*z, s, m);
+            const int is_square = eom_fabs(g16) > 8*eom_fabs(g4) && eom_fabs(g16 - 20*g4 + 64*value) < eom_fabs(g16)/16;
 
-        eom_interpolate(q, qd, s, z);
-        eom_event_functions(value, q, qd, s->t0 + z*s->size, m);
+            e->is_driven = is_square && value*(real)s->event[k].contact < 0;
+#if EOM_SEVERAL
+            e->from = e->is_driven ? z : 0;
 #endif
-        value[k] -= s->event[k].offset;
-        if (eom_fabs(value[k]) > rounding)
-            return value[k] > 0 ? 1 : -1;
+            return e->is_driven ? 0 : value > 0 ? 1 : -1;
+        }
+#else
+        if (eom_fabs(value) > rounding)
+            return value > 0 ? 1 : -1;
+#endif
     }
     return (e->g[EOM_SAMPLES - 1] > 0) - (e->g[EOM_SAMPLES - 1] < 0);
 }
 
-/* Evaluate the event functions at the nodes, fit their series, and set unknown signs. */
-static void eom_sample_events(eom_event_samples *samples, eom_run_state *s, const eom_model *m)
+/* Sample the event functions, fit their series, set unknown signs. Returns 1 + the index of a NaN. */
+static int eom_sample_events(eom_event_samples *samples, eom_run_state *s, const eom_model *m)
 {
-    static const real FAR = 12; /* times `change`: 8 intervals, with a margin of 1.5 */
-
+#if EOM_ADAPTIVE
     for (int j = 0; j < EOM_SAMPLES; j++) {
         real q[EOM_NQ], qd[EOM_NQ], value[EOM_NE];
-#if EOM_ADAPTIVE
         const real z = s->part_start + eom_nodes[j]*s->part_width;
 
         if (s->part_width < 1)
             eom_interpolate(q, qd, s, z);
         else
             eom_interpolate_node(q, qd, s, j);
-#else
-
-        eom_interpolate(q, qd, s, eom_nodes[j]);
-#endif
-#if EOM_ADAPTIVE
         eom_event_functions(value, q, qd, s->t0 + z*s->size, m);
-#else
-        eom_event_functions(value, q, qd, s->t0 + eom_nodes[j]*s->size, m);
-#endif
         for (int k = 0; k < EOM_NE; k++)
             samples[k].g[j] = value[k] - s->event[k].offset;
     }
+#else
+#if EOM_SEVERAL
+    for (int j = 0; j < EOM_SAMPLES; j++) {
+        real q[EOM_NQ], qd[EOM_NQ], value[EOM_NE];
+
+        eom_interpolate(q, qd, s, eom_nodes[j]);
+        eom_event_functions(value, q, qd, s->t0 + eom_nodes[j]*s->size, m);
+        for (int k = 0; k < EOM_NE; k++)
+            samples[k].g[j] = value[k] - s->event[k].offset;
+    }
+#else
+    for (int j = 0; j < EOM_SAMPLES; j++)
+        samples->g[j] = eom_evaluate_event(0, eom_nodes[j], s, m);
+#endif
+#endif
     for (int k = 0; k < EOM_NE; k++) {
         eom_event_samples *const e = &samples[k];
 
         e->largest = eom_fabs(e->g[0]);
+#if EOM_JUMPS
+        e->change = e->from = e->is_driven = 0;
+#else
         e->change = e->from = 0;
+#endif
+        for (int j = 0; j < EOM_SAMPLES; j++)
+            if (e->g[j] != e->g[j])
+                return k + 1;
         for (int j = 1; j < EOM_SAMPLES; j++) {
             e->largest = eom_greater(eom_fabs(e->g[j]), e->largest);
             e->change = eom_greater(eom_fabs(e->g[j] - e->g[j - 1]), e->change);
         }
-        e->is_far = eom_fabs(e->g[0]) > FAR*e->change;
+        e->is_far = eom_fabs(e->g[0]) > 12*e->change; /* 8 intervals, with a margin of 1.5 */
         if (!e->is_far)
             eom_fit_series(e->c, e->g);
         if (s->event[k].sign == 0)
             s->event[k].sign = eom_leaving_sign(k, e, s, m);
     }
+    return 0;
 }
 
+#if EOM_SEVERAL
+/*
+ * The first fraction after samples->from at which event function k, which has this sign there, crosses zero; 2: there is
+ * none. Of one that is driven: samples->from. An interval whose ends have this sign, where the function first approaches
+ * zero, may have one before the extremum.
+ */
+#else
 /*
  * The first fraction after samples->from at which event function k, which has this sign there, crosses zero; 2: there is
  * none. An interval whose ends have this sign, where the function first approaches zero, may have one before the extremum.
  */
+#endif
 #if EOM_INITIAL_EVENTS
 static real eom_find_root(int k, real sign, eom_event_samples *samples)
 #else
 static real eom_find_root(real sign, eom_event_samples *samples)
 #endif
 {
-    static const real ROUNDING = 64*EOM_EPS; /* relative to the largest change */
-    const real *const c = samples->c, rounding = ROUNDING*samples->change;
+    const real *const c = samples->c, rounding = 64*EOM_EPS*samples->change;
 #if EOM_INITIAL_EVENTS
     const real below = eom_above[k] ? rounding + samples->noise : 0;
 #endif
     real d[EOM_SAMPLES], low = samples->from, slope_high;
 
+#if EOM_SEVERAL
+#if EOM_JUMPS
+    if (samples->is_driven)
+        return samples->from;
+#endif
+#endif
     if (samples->is_far)
         return 2;
     eom_differentiate_series(d, c);
     slope_high = eom_evaluate_series(d, low);
     for (int j = 1; j < EOM_SAMPLES; j++) {
         const real slope_low = slope_high;
-        real high = eom_nodes[j], value = samples->g[j];
 #if EOM_INITIAL_EVENTS
-        real threshold = below;
+        real high = eom_nodes[j], value = samples->g[j], threshold = below;
 #else
-        real threshold = 0;
+        real high = eom_nodes[j], value = samples->g[j], threshold = 0;
 #endif
 
         if (high <= low)
@@ -191,18 +252,16 @@ static real eom_find_root(real sign, eom_event_samples *samples)
 /* Store an event in the next row of events; output->which NULL: count it only. */
 static void eom_record_event(eom_output *output, const eom_root *x)
 {
-    enum { NQ = EOM_NQ, WIDTH = 1 + 2*NQ };
-
 #if EOM_INITIAL_EVENTS
     if (output->which && output->events >= output->room)
         return;
 #endif
     if (output->which) {
-        real *const row = output->event_rows + WIDTH*output->events;
+        real *const row = output->event_rows + (1 + 2*EOM_NQ)*output->events;
 
         output->which[output->events] = x->k;
         row[0] = x->t;
-        eom_copy_state(row + 1, row + 1 + NQ, x->q, x->qd);
+        eom_copy_state(row + 1, row + 1 + EOM_NQ, x->q, x->qd);
     }
     output->events++;
 }
@@ -326,17 +385,9 @@ static void eom_move_root(eom_root *x, real z, const eom_run_state *s, const eom
 
 #endif
 #if EOM_JUMPS
-/* Whether the last jump is at most 4 times as far before the root as the start of the step. */
-static int eom_jumped_recently(const eom_run_state *s, const eom_root *x)
-{
-    return x->t - s->event[x->k].jump_time <= 4*(x->t - s->t0);
-}
-
-#endif
-#if EOM_JUMPS
 /*
  * Whether to accept the root x although a residual is left: values more than 64 times as large follow, and precede
- * (x->hidden: none do) unless a jump has started the step.
+ * (x->hidden: none do) unless the last jump is at most 4 times as far before the root as the start of the step.
  */
 #else
 /*
@@ -355,7 +406,7 @@ static int eom_accept_root(eom_root *x, real residual, const eom_run_state *s, c
             after = eom_greater(-sign*samples->g[j], after);
 #if EOM_JUMPS
     x->hidden = before <= significant;
-    return after > significant && (!x->hidden || eom_jumped_recently(s, x));
+    return after > significant && (!x->hidden || x->t - s->event[x->k].jump_time <= 4*(x->t - s->t0));
 #else
     return after > significant && before > significant;
 #endif
@@ -376,8 +427,7 @@ static int eom_accept_root(eom_root *x, real residual, const eom_run_state *s, c
 static int eom_refine_root(eom_root *x, const eom_event_samples *samples, const eom_run_state *s, const eom_model *m, eom_output *output)
 {
     enum { MAX_SECANTS = 6, MAX_BISECTIONS = 59 };
-    static const real NEAR = (real)0.1, CLOSE = EOM_CLOSE, ROUNDING = EOM_EPS; /* fractions */
-    static const real AT_ROOT = 100*EOM_CLOSE; /* residual, relative to the largest value */
+    static const real NEAR = (real)0.1, AT_ROOT = 100*EOM_CLOSE; /* a fraction; a residual, relative */
     const real sign = (real)s->event[x->k].sign, offset = s->event[x->k].offset;
     real z = x->z, slope = samples->slope, correction = 0, last_value = 0, value;
     real low = samples->from, high = sign*samples->g[EOM_SAMPLES - 1] < 0 ? 1 : samples->high;
@@ -385,10 +435,10 @@ static int eom_refine_root(eom_root *x, const eom_event_samples *samples, const 
     eom_evaluate_root(x, z, s, m, output);
     for (int i = 0;; i++) {
         value = x->value[x->k] - offset;
-        if (eom_fabs(correction) > CLOSE && (value - last_value)/correction*slope > 0)
+        if (eom_fabs(correction) > EOM_CLOSE && (value - last_value)/correction*slope > 0)
             slope = (value - last_value)/correction;
         correction = -value/slope;
-        if (i == MAX_SECANTS || !(eom_fabs(correction) <= NEAR && eom_fabs(correction) > ROUNDING))
+        if (i == MAX_SECANTS || !(eom_fabs(correction) <= NEAR && eom_fabs(correction) > EOM_EPS))
             break;
         correction = (z + correction < low ? low : z + correction > 1 ? 1 : z + correction) - z;
         z += correction;
@@ -432,38 +482,37 @@ static void eom_set_offset(eom_run_state *s, const eom_root *x, eom_event_sample
 #endif
 #if EOM_ADAPTIVE
 /*
- * Detect the events in the part of the last step in the order of time. Returns whether one ends the step: x = where it
+ * Detect the events in the part of the last step in the order of time. x->z <= 1: one ends the step, and x = where it
  * stops the run or makes the state jump, or where there are x->limit events.
  */
-static int eom_detect_in_part(eom_root *x, eom_event_samples *samples, eom_run_state *s, const eom_model *m, eom_output *output)
+static eom_status eom_detect_in_part(eom_root *x, eom_event_samples *samples, eom_run_state *s, const eom_model *m, eom_output *output)
 #else
 #if EOM_ONLY_JUMPS
-/* Detect the first event in the last step. Returns whether there is one: x = where the state jumps. */
+/* Detect the first event in the last step. x->z <= 1: there is one; x = where the state jumps. */
 #else
 /*
- * Detect the events in the last step in the order of time. Returns whether one ends the step: x = where it stops the
+ * Detect the events in the last step in the order of time. x->z <= 1: one ends the step, and x = where it stops the
  * run or makes the state jump, or where there are EOM_MAX_EVENTS events in the step.
  */
 #endif
-static int eom_detect_events(eom_root *x, eom_run_state *s, const eom_model *m, eom_output *output)
+static eom_status eom_detect_events(eom_root *x, eom_run_state *s, const eom_model *m, eom_output *output)
 #endif
 {
-    static const real NEAR = (real)0.01, DIFFERENCE = EOM_DIFFERENCE; /* fractions */
-    static const real LEFT_ZERO = 100; /* multiple of the offset: the root has been left */
-    static const real ROUNDING = 64*EOM_EPS; /* relative */
 #if EOM_ADAPTIVE
-    const real rounding = ROUNDING*(1 + eom_fabs(s->t)/(s->part_width*s->size)); /* of a fraction */
+    const real rounding = 64*EOM_EPS*(1 + eom_fabs(s->t)/(s->part_width*s->size)); /* of a fraction */
 #else
-    const real rounding = ROUNDING*(1 + eom_fabs(s->t)/s->size); /* of a fraction */
+    const real rounding = 64*EOM_EPS*(1 + eom_fabs(s->t)/s->size); /* of a fraction */
     eom_event_samples samples[EOM_NE];
 #endif
-    const real margin = rounding < NEAR ? rounding : NEAR;
+    const real margin = rounding < (real)0.01 ? rounding : (real)0.01;
 
 #if !EOM_ADAPTIVE
 #if !EOM_ONLY_JUMPS
     x->limit = output->events + EOM_MAX_EVENTS;
 #endif
-    eom_sample_events(samples, s, m);
+    output->stopped = eom_sample_events(samples, s, m);
+    if (output->stopped)
+        return EOM_NOT_FINITE;
 #endif
 #if EOM_RECORDS
     for (int k = 0; k < EOM_NE; k++)
@@ -476,6 +525,10 @@ static int eom_detect_events(eom_root *x, eom_run_state *s, const eom_model *m, 
     for (int n = 0; eom_first_root(x, s, samples, margin); n++) {
 #else
     x->k = 0;
+#if EOM_JUMPS
+    if (samples->is_driven)
+        return EOM_ACCUMULATED;
+#endif
 #if EOM_INITIAL_EVENTS
     for (int n = 0; (x->z = eom_find_root(0, (real)s->event[0].sign, samples)) <= 1; n++) {
 #else
@@ -484,13 +537,19 @@ static int eom_detect_events(eom_root *x, eom_run_state *s, const eom_model *m, 
 #endif
         const int k = x->k, wrong_direction = eom_direction[k] == s->event[k].sign;
 
+#if EOM_SEVERAL
+#if EOM_JUMPS
+        if (samples[k].is_driven)
+            return EOM_ACCUMULATED;
+#endif
+#endif
         x->scale = samples[k].largest + EOM_TINY;
 #if EOM_JUMPS
         x->height = eom_greater(eom_fabs(samples[k].g[0]), eom_fabs(eom_evaluate_series(samples[k].c, x->z/2)));
         x->hidden = 0;
 #endif
         if (!wrong_direction && !eom_refine_root(x, &samples[k], s, m, output)) {
-            samples[k].from = n < EOM_MAX_EVENTS ? x->z + DIFFERENCE : 1; /* it only touches zero */
+            samples[k].from = n < EOM_MAX_EVENTS ? x->z + EOM_DIFFERENCE : 1; /* it only touches zero */
             continue;
         }
         s->event[k].sign *= -1;
@@ -503,21 +562,23 @@ static int eom_detect_events(eom_root *x, eom_run_state *s, const eom_model *m, 
         samples[k].from = x->z < 1 - margin ? x->z : 1; /* the remainder is rounding */
         if (wrong_direction)
             continue;
+        if (s->t - x->t <= 64*EOM_EPS*eom_fabs(x->t)) /* too short for another step */
+            x->t = s->t;
         eom_record_event(output, x);
 #if EOM_ONLY_JUMPS
-        return 1;
+        return EOM_OK;
 #else
         eom_set_offset(s, x, &samples[k]);
         if (eom_action[k] == 0 && output->events < x->limit)
             continue;
         output->stopped = eom_action[k] == 1 ? k + 1 : 0;
-        return 1;
+        return EOM_OK;
 #endif
     }
     for (int k = 0; k < EOM_NE; k++)
-        if (eom_fabs(samples[k].g[EOM_SAMPLES - 1]) > LEFT_ZERO*eom_fabs(s->event[k].offset))
+        if (eom_fabs(samples[k].g[EOM_SAMPLES - 1]) > 100*eom_fabs(s->event[k].offset)) /* the root has been left */
             s->event[k].offset = 0;
-    return 0;
+    return EOM_OK;
 }
 
 #if EOM_ADAPTIVE
@@ -525,22 +586,26 @@ static int eom_detect_events(eom_root *x, eom_run_state *s, const eom_model *m, 
  * Detect the events in the last step, as eom_detect_in_part, in parts that resolve the event functions: an adaptive step
  * is halved where it does not. If that does not help, since there is a kink, the remainder of the step is one part.
  */
-static int eom_detect_events(eom_root *x, eom_run_state *s, const eom_model *m, eom_output *output)
+static eom_status eom_detect_events(eom_root *x, eom_run_state *s, const eom_model *m, eom_output *output)
 {
     static const real MIN_WIDTH = (real)0.0009765625; /* 2^-10 */
     int resolves = !s->fixed;
     eom_event_samples samples[EOM_NE];
+    eom_status status = EOM_OK;
     real end;
 
+    x->z = 2;
 #if !EOM_ONLY_JUMPS
     x->limit = output->events + EOM_MAX_EVENTS;
 #endif
-    for (s->part_start = 0; s->part_start < 1; s->part_start = end) {
+    for (s->part_start = 0; !status && x->z > 1 && s->part_start < 1; s->part_start = end) {
         const real rest = 1 - s->part_start, width = resolves && s->part_size > 0 ? 2*s->part_size/s->size : 1;
 
         s->part_width = width < rest ? width : rest;
         for (;;) {
-            eom_sample_events(samples, s, m);
+            output->stopped = eom_sample_events(samples, s, m);
+            if (output->stopped)
+                return EOM_NOT_FINITE;
             if (!resolves || eom_is_resolved(s, samples, m))
                 break;
             resolves = s->part_width > MIN_WIDTH;
@@ -550,10 +615,9 @@ static int eom_detect_events(eom_root *x, eom_run_state *s, const eom_model *m, 
         end = s->part_width < rest ? s->part_start + s->part_width : 1;
         if (s->part_width == width)
             s->part_size = width < 1 ? width*s->size : 0;
-        if (eom_detect_in_part(x, samples, s, m, output))
-            return 1;
+        status = eom_detect_in_part(x, samples, s, m, output);
     }
-    return 0;
+    return status;
 }
 
 #endif
@@ -574,15 +638,14 @@ static int eom_have_events_changed(const eom_run_state *s, const real *before, c
 #if EOM_JUMPS
 /*
  * Set the signs of event functions that a jump at the root x, or new inputs or parameters (x NULL), have changed from
- * `before`: no event is reported. A function that the jump leaves at its root has its value there as the new zero level
- * (offset, not 0); eom_leaving_sign finds its sign in the next step, by that mark.
+ * `before`: no event is reported. The value of one that the jump leaves at its root is its new zero level (offset, not 0),
+ * by which eom_leaving_sign finds its sign in the next step.
  */
 #else
 /* Set the signs of event functions that new inputs or parameters have changed from `before`: no event is reported. */
 #endif
 static void eom_update_signs(eom_run_state *s, const real *before, const eom_root *x, const eom_model *m)
 {
-    static const real ROUNDING = EOM_CLOSE; /* a smaller relative change leaves the sign as it is */
 #if EOM_SEVERAL
     static const real SAME_TIME = 16*EOM_EPS; /* relative */
 #endif
@@ -595,24 +658,24 @@ static void eom_update_signs(eom_run_state *s, const real *before, const eom_roo
 #if EOM_JUMPS
 #if EOM_SEVERAL
         const int jumps = x && (k == x->k || s->t - e->root_time <= SAME_TIME*eom_fabs(s->t));
-        const int is_at_root = jumps && change <= ROUNDING*x->scale;
-        const int has_changed = change > ROUNDING*size && !(x && size <= ROUNDING*x->scale);
-#else
-        const int is_at_root = x && change <= ROUNDING*x->scale;
-#endif
+        const int has_changed = change > EOM_CLOSE*size && !(x && size <= EOM_CLOSE*x->scale);
 
-        if (is_at_root) {
+        if (jumps && change <= EOM_CLOSE*x->scale) {
+#else
+
+        if (x && change <= EOM_CLOSE*x->scale) {
+#endif
             e->sign = 0;
             e->offset = value[k] == 0 ? EOM_TINY : value[k];
 #if EOM_SEVERAL
         } else if (has_changed) {
 #else
-        } else if (change > ROUNDING*size) {
+        } else if (change > EOM_CLOSE*size) { /* a smaller change leaves the sign as it is */
 #endif
 #else
 
         (void)x;
-        if (change > ROUNDING*size) {
+        if (change > EOM_CLOSE*size) { /* a smaller change leaves the sign as it is */
 #endif
             e->sign = (value[k] > 0) - (value[k] < 0);
             e->offset = 0;

@@ -19,14 +19,13 @@ static void eom_interpolate(real *q, real *qd, const eom_run_state *s, real z)
  */
 static real eom_next_grid_time(eom_run_state *s, real t_end, real h)
 {
-    static const real ROUNDING = 64*EOM_EPS; /* of times, relative */
     real near, end;
 
     if (s->grid_step != h) {
         s->grid_step = h;
         s->grid_start = s->t;
     }
-    near = ROUNDING*(eom_fabs(s->t) + eom_fabs(s->grid_start));
+    near = 64*EOM_EPS*(eom_fabs(s->t) + eom_fabs(s->grid_start));
     near = near < h/4 ? near : h/4;
     end = s->grid_start + (1 + eom_floor((s->t - s->grid_start + near)/h))*h;
     end = end < t_end - near ? end : t_end;
@@ -38,20 +37,17 @@ static real eom_next_grid_time(eom_run_state *s, real t_end, real h)
 }
 
 /*
- * Store the interpolant of a step of size h from s->q, s->qd to q, qd (quintic Hermite interpolation). It matches
- * positions, velocities and accelerations (before, after) at both ends. Accelerations: even + odd x + second (x^2 - 1)
- * + cubic (x^3 - x), x = 2 z - 1; cubic = 0 if it is rounding. Means over the step: of these, and of them times 1 - z
- * (weighted_mean).
+ * Store the interpolant of a step of size h from s->q, s->qd to q, qd, of degree five (Hermite). It matches positions,
+ * velocities and accelerations (before, after) at both ends. Accelerations: even + odd x + second (x^2 - 1)
+ * + cubic (x^3 - x), x = 2 z - 1; cubic = 0 if it is rounding. mean, weighted_mean: of them, and of 1 - z times them.
  */
 static void eom_fit_interpolant(eom_run_state *s, const real *q, const real *qd, const real *before, const real *after, real h)
 {
-    static const real ROUNDING = 64*EOM_EPS; /* of positions, relative */
-
     for (int k = 0; k < EOM_NQ; k++) {
         const real mean = (qd[k] - s->qd[k])/h, weighted_mean = ((q[k] - s->q[k])/h - s->qd[k])/h;
         const real even = (before[k] + after[k])/2, odd = (after[k] - before[k])/2;
         const real third = (real)2.5*odd - (real)7.5*(mean - 2*weighted_mean), second = (real)1.5*(even - mean);
-        const real cubic = eom_fabs(third)*h*h > ROUNDING*eom_fabs(q[k]) ? third : 0;
+        const real cubic = eom_fabs(third)*h*h > 64*EOM_EPS*eom_fabs(q[k]) ? third : 0;
         real *const power = s->powers[k];
 
 #if EOM_ADAPTIVE
@@ -94,8 +90,6 @@ static eom_status eom_step_on_grid(eom_run_state *s, real t_end, real step, cons
     real q[EOM_WIDTH] = { 0 }, qd[EOM_WIDTH] = { 0 }, before[EOM_WIDTH], after[EOM_WIDTH], end, h;
     eom_status status;
 
-    if (!(step > 0))
-        return EOM_NOT_FINITE;
     end = eom_next_grid_time(s, t_end, step);
     h = eom_fabs(end - s->t - step) <= 2*EOM_EPS*eom_fabs(end) ? step : end - s->t;
     eom_copy_state(q, qd, s->q, s->qd);

@@ -35,8 +35,7 @@ static void eom_set_sliding(real *q, real *qd, const int *sticks, real fastest)
 #endif
 static eom_status eom_apply_jump(real *q, real *qd, int k, real t, const eom_model *m, eom_output *output)
 {
-    enum { NE = EOM_NE, NQ = EOM_NQ };
-    real maps[NE*2*NQ], *const after = maps + 2*NQ*k;
+    real maps[EOM_NE*2*EOM_NQ], *const after = maps + 2*EOM_NQ*k;
 #if EOM_SETS
     eom_status status = EOM_OK;
 #endif
@@ -46,7 +45,7 @@ static eom_status eom_apply_jump(real *q, real *qd, int k, real t, const eom_mod
 #endif
 
     eom_jump_maps(maps, q, qd, t, m);
-    if (!eom_finite(after, 2*NQ)) {
+    if (!eom_finite(after, 2*EOM_NQ)) {
         output->stopped = k + 1;
         return EOM_NOT_FINITE;
     }
@@ -54,9 +53,9 @@ static eom_status eom_apply_jump(real *q, real *qd, int k, real t, const eom_mod
     if (k < EOM_OWN_EVENTS)
         eom_release_sticking(after, sticks, q);
 #endif
-    eom_copy_state(q, qd, after, after + NQ);
+    eom_copy_state(q, qd, after, after + EOM_NQ);
 #if EOM_MODES
-    for (int i = 0; i < NQ; i++)
+    for (int i = 0; i < EOM_NQ; i++)
         fastest = eom_fabs(qd[i]) > fastest ? eom_fabs(qd[i]) : fastest;
 #endif
 #if EOM_SETS
@@ -75,34 +74,25 @@ static eom_status eom_apply_jump(real *q, real *qd, int k, real t, const eom_mod
 }
 
 /*
- * Update the intervals between the jumps of event x->k. Returns whether they accumulate (Zeno behaviour): the intervals
- * vanish within rounding; or heights do, each of which is ratio^2 times the last, or they hide the root; or many jumps
- * coincide. output->limit: after intervals T, T', the geometric series of the next has the sum T'^2/(T - T').
+ * Update the intervals between jumps of event x->k. Returns whether they accumulate (Zeno behaviour): intervals or heights,
+ * each ratio^2 times the last, vanish within rounding; or heights hide the root; or many jumps coincide. The intervals
+ * after T, T' have the sum T'^2/(T - T'); a ratio below 1e-6 is by chance.
  */
 static int eom_update_accumulation(eom_run_state *s, const eom_root *x, const eom_model *m, eom_output *output)
 {
-    static const real SAME_TIME = 16*EOM_EPS, SHORTEST = 64*EOM_EPS; /* relative intervals */
-    static const real TIME_ROUNDING = 4*EOM_EPS; /* a relative remaining time */
-    static const real COINCIDENCE = (real)1e-6; /* ratio of two intervals: less is by chance */
-    static const real NOISE = 16; /* multiple of a rounding error */
+    static const real SAME_TIME = 16*EOM_EPS; /* relative */
     eom_event_state *const e = &s->event[x->k];
     const real t = eom_fabs(x->t), elapsed = x->t - e->jump_time, last = e->interval;
     const real interval = elapsed > SAME_TIME*t ? elapsed : 0, ratio = interval < last ? interval/last : 1;
     const real remaining_time = interval*ratio/(1 - ratio); /* unused if ratio = 1 */
-#if EOM_SEVERAL
-    const int coincides = x->t - s->jumped <= SAME_TIME*t;
-#else
-    const int coincides = interval == 0;
-#endif
-    const int interval_vanishes = ratio > COINCIDENCE && ratio < 1 && (remaining_time <= TIME_ROUNDING*t || interval <= SHORTEST*t);
-    const int height_vanishes = eom_jumped_recently(s, x) && ratio*ratio*x->height <= NOISE*eom_event_rounding(x->k, x->q, x->qd, x->t, m);
-#if EOM_MODES
-    const int is_noise = x->k < EOM_OWN_EVENTS && (x->hidden || height_vanishes);
-#else
-    const int is_noise = x->hidden || height_vanishes;
-#endif
+    const int interval_vanishes = ratio > (real)1e-6 && ratio < 1 && (remaining_time <= 4*EOM_EPS*t || interval <= 64*EOM_EPS*t);
+    const int is_low = elapsed <= 4*(x->t - s->t0) && ratio*ratio*x->height <= 16*eom_event_rounding(x->k, x->q, x->qd, x->t, m);
 
-    s->simultaneous_jumps = coincides ? s->simultaneous_jumps + 1 : 0;
+#if EOM_SEVERAL
+    s->simultaneous_jumps = x->t - s->jumped <= SAME_TIME*t ? s->simultaneous_jumps + 1 : 0;
+#else
+    s->simultaneous_jumps = interval == 0 ? s->simultaneous_jumps + 1 : 0;
+#endif
     e->jump_time = x->t;
 #if EOM_SEVERAL
     s->jumped = x->t;
@@ -111,10 +101,12 @@ static int eom_update_accumulation(eom_run_state *s, const eom_root *x, const eo
         e->interval = interval;
         s->h = s->h > 2*interval ? 2*interval : s->h;
     }
-    if (s->simultaneous_jumps < EOM_MAX_SIMULTANEOUS && !is_noise && !interval_vanishes)
-        return 0;
     output->limit = s->simultaneous_jumps || !(ratio < 1) ? x->t : x->t + remaining_time;
-    return 1;
+#if EOM_MODES
+    return s->simultaneous_jumps >= EOM_MAX_SIMULTANEOUS || interval_vanishes || (x->k < EOM_OWN_EVENTS && (x->hidden || is_low));
+#else
+    return s->simultaneous_jumps >= EOM_MAX_SIMULTANEOUS || interval_vanishes || x->hidden || is_low;
+#endif
 }
 
 #endif
@@ -141,6 +133,15 @@ static eom_status eom_restart(eom_run_state *s, eom_root *x, const eom_model *m,
 #else
     (void)output;
 #endif
+#endif
+#if EOM_JUMPS
+    s->event[x->k].contact = -s->event[x->k].sign;
+#endif
+#if EOM_SWITCHES
+    for (int i = 0; i < EOM_NQ; i++) /* a coordinate at rest, on which the motion depends, switches a mode */
+        if (eom_switch[i] && x->q[i] != s->q[i] && x->qd[i] == 0 && s->qd[i] == 0)
+            for (int k = 0; k < EOM_NE; k++)
+                s->event[k].contact = 0;
 #endif
     eom_copy_state(s->q, s->qd, x->q, x->qd);
     s->t = x->t;

@@ -47,6 +47,9 @@ static void eom_store_times(eom_output *output, const eom_options *options, cons
 static int eom_begin_run(eom_run_state *s, const real *q, const real *qd, const eom_options *options, const eom_model *m, eom_output *output)
 {
     const real t = output->has_started ? output->t : options->t0;
+#if EOM_JUMPS
+    const int has_jumped = output->has_started && t <= output->limit; /* a moment ago */
+#endif
     int warm = output->has_started && output->memory && output->memory->warm;
 
     if (warm) {
@@ -65,8 +68,10 @@ static int eom_begin_run(eom_run_state *s, const real *q, const real *qd, const 
         for (int k = 0; k < EOM_NE; k++)
             s->event[k].root_time = -EOM_HUGE;
 #endif
-        for (int k = 0; k < EOM_NE; k++)
+        for (int k = 0; k < EOM_NE; k++) {
             s->event[k].jump_time = t;
+            s->event[k].contact = has_jumped ? -eom_direction[k] : 0;
+        }
 #endif
 #endif
         eom_copy_state(s->q, s->qd, q, qd);
@@ -99,9 +104,7 @@ static int eom_begin_run(eom_run_state *s, const real *q, const real *qd, const 
 /* Make the next step, detect its events, store its rows, and jump or stop where an event does. */
 static eom_status eom_step_with_events(eom_run_state *s, const eom_options *options, const eom_model *m, eom_output *output)
 {
-    static const real ROUNDING = 64*EOM_EPS; /* of times, relative */
     eom_root x;
-    int has_event;
 #if EOM_ADAPTIVE
     eom_status status = s->fixed ? eom_step_on_grid(s, options->t_end, options->h, m, output) : eom_adaptive_step(s, options->t_end, s->tol, options->max_step, m, output);
 #else
@@ -110,11 +113,15 @@ static eom_status eom_step_with_events(eom_run_state *s, const eom_options *opti
 
     if (status)
         return status;
-    has_event = eom_detect_events(&x, s, m, output);
-    if (has_event && options->t_end - x.t <= ROUNDING*eom_fabs(x.t)) /* too short for another step */
-        x.t = options->t_end;
-    eom_store_times(output, options, s, has_event ? x.t : s->t, m);
-    if (has_event) {
+    status = eom_detect_events(&x, s, m, output);
+    if (status) { /* already at the start of the step */
+        eom_copy_state(s->q, s->qd, s->q0, s->qd0);
+        s->t = s->t0;
+        s->size = 0;
+        return status;
+    }
+    eom_store_times(output, options, s, x.z <= 1 ? x.t : s->t, m);
+    if (x.z <= 1) {
 #if EOM_ONLY_JUMPS
         eom_store_step(output, options, x.t, x.q, x.qd);
 #else
@@ -131,7 +138,8 @@ static eom_status eom_step_with_events(eom_run_state *s, const eom_options *opti
             status = eom_project_state(s->q, s->qd, s->t, 0, m);
 #endif
     }
-    eom_store_step(output, options, s->t, s->q, s->qd);
+    if (status != EOM_NOT_FINITE)
+        eom_store_step(output, options, s->t, s->q, s->qd);
     return status;
 }
 
@@ -141,22 +149,25 @@ static eom_status eom_run(real *q, real *qd, const eom_options *options, const e
 {
     enum { FITS = 1/(sizeof(eom_run_state) <= sizeof output->memory->data) }; /* else an error */
     eom_run_state s;
-#if EOM_EVENTS
     const int continues = eom_begin_run(&s, q, qd, options, m, output);
+#if EOM_EVENTS
+#if EOM_ADAPTIVE
+    const int is_valid = options->h >= 0 && eom_finite(&s.t, 1) && options->t_end == options->t_end;
+#else
+    const int is_valid = options->h > 0 && eom_finite(&s.t, 1) && options->t_end == options->t_end;
 #endif
-    eom_status status;
+#else
+    const int is_valid = eom_finite(&s.t, 1) && options->t_end == options->t_end;
+#endif
+    eom_status status = is_valid ? EOM_OK : EOM_NOT_FINITE;
 #if EOM_INITIAL_EVENTS
-    int applies;
+    const int applies = !continues || eom_have_events_changed(&s, s.last_values, m);
 #endif
 
 #if !EOM_EVENTS
-    (void)eom_begin_run(&s, q, qd, options, m, output);
+    (void)continues;
 #endif
-    status = eom_finite(&s.t, 1) && options->t_end == options->t_end ? EOM_OK : EOM_NOT_FINITE;
 #if EOM_EVENTS
-#if EOM_INITIAL_EVENTS
-    applies = !continues || eom_have_events_changed(&s, s.last_values, m);
-#endif
     if (continues)
         eom_update_signs(&s, s.last_values, 0, m);
 #if EOM_INITIAL_EVENTS
@@ -169,13 +180,16 @@ static eom_status eom_run(real *q, real *qd, const eom_options *options, const e
         if (output->stopped || (output->which && output->events + EOM_MAX_EVENTS > output->room))
             break;
 #endif
+#if EOM_EVENTS
+        if (options->max_evaluations && output->evaluations >= options->max_evaluations)
+            status = EOM_TOO_LONG;
+        else
+            status = eom_step_with_events(&s, options, m, output);
+#else
         if (options->max_evaluations && output->evaluations >= options->max_evaluations) {
             status = EOM_TOO_LONG;
             break;
         }
-#if EOM_EVENTS
-        status = eom_step_with_events(&s, options, m, output);
-#else
         status = eom_adaptive_step(&s, options->t_end, s.tol, options->max_step, m, output);
         if (status)
             break;

@@ -18,22 +18,20 @@ static real eom_evaluate_series(const real *c, real x)
 /* c = the series with values g at the nodes: a cosine transform, in which end terms count half. */
 static void eom_fit_series(real *c, const real *g)
 {
-    enum { LAST = EOM_SAMPLES - 1 };
+    const real last = g[EOM_SAMPLES - 1];
 
-    for (int n = 0; n <= LAST; n++)
-        c[n] = (2*eom_evaluate_series(g, eom_nodes[n]) - g[0] - (n % 2 ? -g[LAST] : g[LAST]))/(real)LAST;
+    for (int n = 0; n < EOM_SAMPLES; n++)
+        c[n] = (2*eom_evaluate_series(g, eom_nodes[n]) - g[0] - (n % 2 ? -last : last))/(EOM_SAMPLES - 1);
     c[0] /= 2;
-    c[LAST] /= 2;
+    c[EOM_SAMPLES - 1] /= 2;
 }
 
 /* d = the derivative of a series by x. */
 static void eom_differentiate_series(real *d, const real *c)
 {
-    enum { LAST = EOM_SAMPLES - 1 };
-
-    d[LAST] = 0;
-    for (int n = LAST; n > 0; n--)
-        d[n - 1] = (n < LAST ? d[n + 1] : 0) - (real)(4*n)*c[n];
+    d[EOM_SAMPLES - 1] = 0;
+    for (int n = EOM_SAMPLES - 1; n > 0; n--)
+        d[n - 1] = (n < EOM_SAMPLES - 1 ? d[n + 1] : 0) - (real)(4*n)*c[n];
     d[0] /= 2;
 }
 

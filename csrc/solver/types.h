@@ -18,6 +18,9 @@ typedef enum { EOM_CONVERGED, EOM_NOT_CONVERGED, EOM_UNDEFINED } eom_outcome;
 /* The state of an event between steps. */
 typedef struct {
     int sign; /* of the event function; 0: unknown */
+#if EOM_JUMPS
+    int contact; /* its sign before the last jump; 0: none, or the jump has switched a mode */
+#endif
     real offset; /* zero level: value at the last root, until it is left; 0: none */
 #if EOM_RECORDS
     real largest; /* largest magnitude so far */

@@ -94,8 +94,8 @@ def test_batch_split_into_several_calls_has_the_same_events(
     restitution = np.linspace(0.3, 0.9, 40)
     options = {"params": {"e": restitution}, "duration": 1.9}
     run = balls.simulate_batch(**options, threads=1)
-    monkeypatch.setattr(runtime_module(balls, "events"), "EVENTS_EACH", 32)
-    monkeypatch.setattr(runtime_module(balls, "batch_integration"), "SMALL_GROUP_SIZE", 3)
+    monkeypatch.setattr(runtime_module(balls, "columns"), "EVENTS_EACH", 32)
+    monkeypatch.setattr(runtime_module(balls, "batch"), "SMALL_GROUP_SIZE", 3)
     repeated = balls.simulate_batch(**options, threads=2)
     for name, events in run.events.items():
         for field in ARRAYS:

@@ -84,6 +84,6 @@ def _runs(model: SolverModel) -> Iterator[str]:
     make = _make_step(functions, advances)
     yield show("c/portable/run.c", functions, model=model, advances=advances, make=make)
     if functions.target.integrates:
-        yield show("c/integrate.c", functions, model=model)
+        yield adaptive.integrate(model)
     if functions.target.system.run.batch:
         yield show("c/integrate_batch.c", functions, in_parallel=False)

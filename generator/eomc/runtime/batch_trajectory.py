@@ -336,7 +336,7 @@ class BatchTrajectory(Columns):
         """Return the reason why instance k failed."""
         status, event = str(self.status[k]), self.stopped[k]
         if status == "not finite" and event:
-            return f"event '{event}' jumps to no finite state"
+            return f"event '{event}' jumps to no finite state, or its function is not a number"
         if status == "accumulated":
             return f"jumps follow one another ever sooner, up to t = {self.limit[k]:.15g} s"
         return failure_message(self.model, status, self.tol > 0)

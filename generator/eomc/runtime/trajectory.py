@@ -267,7 +267,8 @@ class Trajectory(Columns):
         if self.status == "ok":
             return progress
         if self.status == "not finite" and self.stopped:
-            return f"event '{self.stopped}' jumps to no finite state at t = {self.t[-1]:.9g} s"
+            reason = "jumps to no finite state, or its function is not a number,"
+            return f"event '{self.stopped}' {reason} at t = {self.t[-1]:.9g} s"
         if self.status == "accumulated":
             return (
                 f"jumps follow one another ever sooner, up to t = {self.limit:.15g} s: there the "

@@ -5,6 +5,7 @@
 #ifndef MODEL_H
 #define MODEL_H
 
+#include <float.h>
 #include <limits.h>
 #include <math.h>
 #include <stdio.h>

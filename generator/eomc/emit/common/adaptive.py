@@ -104,6 +104,12 @@ def library_texts(model: SolverModel, roots: Sequence[str] = ()) -> tuple[str, .
     )
 
 
+def integrate(model: SolverModel) -> str:
+    """Return the definition of the function for a run to a given time."""
+    most = max_events_per_step(model.functions.target.system)
+    return show("c/integrate.c", model.functions, model=model, max_events=most)
+
+
 def library_names(model: SolverModel) -> Names:
     """Return the names of the library for adaptive steps and events in a model's source."""
     functions = model.functions
@@ -136,6 +142,7 @@ def features(functions: SceneFunctions) -> dict[str, bool]:
         "EVENTS": bool(system.events),
         "SEVERAL": len(system.events) > 1,
         "JUMPS": "jumps" in program,
+        "SWITCHES": any(switches(system)),
         "ONLY_JUMPS": all(e.action == "jump" for e in system.events),
         # Events that are ignored where their functions are zero in a whole step, within rounding
         "RECORDS": functions.target.is_adaptive
@@ -229,6 +236,7 @@ COMMENTS = {  # of the tables of integers, by name
     "action": "Actions of the events: 0 record, 1 stop, 2 jump.",
     "above": "Whether the event leaves zero upwards in any case.",
     "mode": "Indices of each friction mode and of the coordinate that it belongs to.",
+    "switch": "Coordinates on which the motion depends, and which jumps set.",
     "jump_sets": "Which entries of [q, qd] the jump of each event sets.",
 }
 
@@ -264,12 +272,27 @@ def event_tables(functions: SceneFunctions) -> tuple[str, ...]:
         integers["mode"] = [(m.at, m.of) for m in system.modes]
     if system.own_events:
         integers["jump_sets"] = _jump_flags(target)
+    if any(flags := switches(system)):
+        integers["switch"] = [int(flag) for flag in flags]
     return (
         *(c.define_int_table(f"eom_{name}", row, COMMENTS[name]) for name, row in integers.items()),
         c_vector("eom_nodes", x, real, "Chebyshev nodes, as fractions of a step."),
         c_matrix("eom_once_integrated", power_integrals(x, stages, 1), real),
         c_matrix("eom_twice_integrated", power_integrals(x, stages, 2), real),
     )
+
+
+def switches(system: System) -> list[bool]:
+    """Return for each coordinate whether jumps set it and the motion or an event depends on it."""
+    jumped = {name for e in system.events for name, _ in e.jump}
+    formulas = (
+        system.kinetic, system.potential, system.linear_potential, system.dissipation,
+        *system.forces, *(e for pair in system.applied for e in pair),
+        *(e for _, e in system.definitions), *(c.formula for c in system.constraints),
+        *(u.signal for u in system.inputs), *(e.when for e in system.events),
+    )  # fmt: skip
+    symbols = {symbol for e in formulas for symbol in e.free_symbols}
+    return [c.name in jumped and c.q in symbols for c in system.coordinates]
 
 
 def _jump_flags(target: Target) -> list[list[int]]:

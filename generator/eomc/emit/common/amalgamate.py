@@ -43,7 +43,7 @@ class Names:
     Attributes
     ----------
     exact
-        Text that replaces a whole name, such as "2.220446049250313e-16" for `EOM_EPS`.
+        Text that replaces a whole name, such as "DBL_EPSILON" for `EOM_EPS`.
     prefixes
         Text that replaces the beginning of other names, such as "ball_" for "eom_". The longest
         beginning applies.

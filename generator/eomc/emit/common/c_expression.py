@@ -60,6 +60,11 @@ class Real:
     def __str__(self) -> str:
         return self.name
 
+    @property
+    def epsilon_name(self) -> str:
+        """The C macro for `epsilon`, of <float.h>."""
+        return "FLT_EPSILON" if self.suffix else "DBL_EPSILON"
+
     def literal(self, value: float) -> str:
         """Return a C literal of this type, such as 0.5f."""
         text = repr(value)

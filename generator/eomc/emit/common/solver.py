@@ -419,7 +419,6 @@ def library_names(model: SolverModel, method: Method | None = None, **exact: str
     real, prefix, PREFIX = functions.target.real, functions.prefix, functions.PREFIX
     libm = {f"eom_{name}": name + real.function_suffix for name in LIBM}
     numbers = {
-        "EOM_EPS": real.epsilon,
         "EOM_SQRT_EPS": math.sqrt(real.epsilon),
         "EOM_FOURTH_ROOT_EPS": real.epsilon**0.25,
         "EOM_TINY": 1e-30,
@@ -436,6 +435,7 @@ def library_names(model: SolverModel, method: Method | None = None, **exact: str
             **stages,
             "EOM_WIDTH": model.extent,
             "EOM_LANES": model.lanes,
+            "EOM_EPS": real.epsilon_name,
             **{name: functions.target.literal(x) for name, x in numbers.items()},
             **exact,
         },

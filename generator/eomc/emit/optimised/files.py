@@ -549,7 +549,7 @@ def _from_library(steppers: Steppers, model: SolverModel) -> Iterator[str]:
         yield from (text.rstrip("\n") + "\n" for text in own)
     if not (integrates or len(run.methods) > 1):
         return
-    yield show("c/integrate.c", functions, model=model)
+    yield adaptive.integrate(model)
     if side_by_side:
         yield show(
             "c/optimised/adaptive_lanes.c", functions, steppers=steppers, method=adaptive.METHOD,

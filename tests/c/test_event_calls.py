@@ -1,0 +1,114 @@
+"""Calls of a scene's C with events: what they refuse, and how jumps that accumulate end them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from support.compilation import STRICT, compiled, run
+from support.session import needs
+
+import eomc
+from eomc.model.system import from_scene
+from eomc.scene.read import parse
+
+BALL = """eomc = 1
+name = "ball"
+[coordinates]
+y = { start = 1.0 }
+[parameters]
+e = 0.5
+[energy]
+kinetic = "y_dot**2/2"
+potential = "9.81*y"
+[[event]]
+name = "impact"
+when = "y"
+direction = "falling"
+action = "jump"
+y_dot = "-e*y_dot"
+[run]
+duration = 3.0
+batch = true
+"""
+PROGRAM = """#include "ball.h"
+#include <stdio.h>
+
+static void print(const char *what, int status, int holds)
+{
+    printf("%s %d %d\\n", what, status, holds);
+}
+
+/* A run in calls of `steps` steps without memory, which go on after one is not OK. */
+static void bounce(const char *what, double e, long steps)
+{
+    ball_params p = ball_defaults;
+    ball_options options = { .h = 0.01, .t_end = 3.0, .every = 1 };
+    ball_output output = { 0 };
+    double q[1] = { 1.0 }, qd[1] = { 0.0 }, end = 0;
+    int status = 0, last = 0, is_above = 1;
+
+    p.e = e;
+    options.steps = steps;
+    while (!status && output.t < options.t_end) {
+        status = (int)ball_integrate(q, qd, &p, &options, &output);
+        is_above &= q[0] > -1e-9;
+    }
+    end = output.t;
+    for (int n = 0; n < 3; n++)
+        last = (int)ball_integrate(q, qd, &p, &options, &output);
+    print(what, status, last == status && is_above && q[0] > -1e-9 && output.t - end < 1e-6);
+}
+
+int main(void)
+{
+    double q[1] = { 1.0 }, qd[1] = { 0.0 }, rows[4], row[3];
+    const double early[2] = { 0.5, 2.0 };
+    int which[1], status;
+    ball_options options = {
+        .t0 = 1.0, .t_end = 2.0, .h = 0.01, .steps = 1000, .every = 1, .rows = 2, .times = early
+    };
+    ball_output output = { .q_rows = rows, .qd_rows = rows + 2 };
+
+    status = (int)ball_integrate(q, qd, &ball_defaults, &options, &output);
+    print("early", status, output.steps == 0);
+    ball_integrate_batch(1, q, qd, &ball_defaults, &options, &output);
+    print("batch", (int)output.status, output.steps == 0);
+    options.rows = 0;
+    options.times = 0;
+    output.which = which;
+    output.event_rows = row;
+    output.room = 1;
+    status = (int)ball_integrate(q, qd, &ball_defaults, &options, &output);
+    print("room", status, output.steps == 0);
+    output.room = 0;
+    output.which = 0;
+    options.ignores_events = 1;
+    options.steps = 50;
+    status = (int)ball_integrate(q, qd, &ball_defaults, &options, &output);
+    print("time", status, output.t > 1.499 && output.t < 1.501);
+    bounce("whole", 0.5, 1000000);
+    bounce("steps", 0.5, 1);
+    bounce("plastic", 0.0, 1000000);
+    bounce("steps", 0.0, 1);
+    bounce("nearly", 1e-8, 3);
+    return 0;
+}
+"""
+
+
+@pytest.mark.parametrize("folder", [".", "fast"])
+@pytest.mark.parametrize("tolerance", ["", "tolerance = 1e-9\n"])
+def test_calls_have_a_status_that_says_what_happened(
+    folder: str, tolerance: str, tmp_path: Path
+) -> None:
+    """Status 6: the options are invalid; 4: jumps accumulate, also in calls without memory."""
+    for name, text in eomc.sources(from_scene(parse(BALL + tolerance, "ball.toml"))).files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    (tmp_path / "calls.c").write_text(PROGRAM, encoding="utf-8")
+    sources = ("calls.c", f"{folder}/ball.c", f"-I{folder}", "-lm", "-o", "calls")
+    compiled(needs("gcc"), *STRICT, "-O1", *sources, cwd=tmp_path)
+    lines = run("./calls", cwd=tmp_path).stdout.splitlines()
+    accumulated = ["whole 4 1", "steps 4 1", "plastic 4 1", "steps 4 1", "nearly 4 1"]
+    assert lines == ["early 6 1", "batch 6 1", "room 6 1", "time 0 1", *accumulated]
