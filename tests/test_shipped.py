@@ -13,6 +13,8 @@ from packaging.requirements import Requirement
 from support.session import ROOT
 from test_architecture import modules, nodes
 
+import eomc
+
 PAGE = (ROOT / "docs" / "SECURITY.md").read_text(encoding="utf-8")
 ROWS = re.findall(r"^\| ([\w-]+) \| (>=[\d.]+) \| (MIT|BSD|PSF|Apache) \| (.+) \|$", PAGE, re.M)
 EXTRAS = {
@@ -106,3 +108,12 @@ def test_pages_load_no_external_resources() -> None:
         text = page.read_text(encoding="utf-8")
         assert "default-src 'none'" in text, page
         assert not re.search(r"<script[^>]* src|<link|@import|url\((?!data:)|//[\w.]+/", text), page
+
+
+def test_citation_has_the_version_and_the_licence_of_the_package() -> None:
+    text = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    fields = dict(re.findall(r'^([\w-]+): "?([^"\n>]+)"?$', text, re.MULTILINE))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert fields["version"] == eomc.__version__
+    assert fields["license"] == project["license"]
+    assert f'- name: "{project["authors"][0]["name"]}"' in text
