@@ -23,9 +23,8 @@ from typing import Any
 import numpy as np
 
 from eomc.sweeps.block import load_module
-from eomc.sweeps.engines import Execution, SweepProgress
 from eomc.sweeps.plan import SweepArguments
-from eomc.sweeps.sweep import run_sweep
+from eomc.sweeps.sweep import Execution, SweepProgress, run_sweep
 
 SCENE = Path(__file__).parents[1] / "scenes" / "cartpole.toml"
 DRAWS = {"theta": {"uniform": [-3, 3]}, "m_p": {"normal": [2, 0.1]}}

@@ -104,7 +104,7 @@ def test_an_error_of_a_worker_names_it(
 
     with monkeypatch.context() as patch:
         patch.setattr("eomc.sweeps.block.load_module", fail)
-        patch.setattr("eomc.sweeps.engines.process_name", lambda: ("elsewhere", 1))
+        patch.setattr("eomc.sweeps.sweep.process_name", lambda: ("elsewhere", 1))
         with pytest.raises(EomcError, match=rf"worker .*:{os.getpid()}: no C compiler found"):
             sweep(scene, over={"m": [1, 2]}, client=InlineExecutor(), out=tmp_path / "a.zarr")
 

@@ -166,7 +166,7 @@ def test_a_sweep_goes_on_after_a_full_disc(
 def test_a_finished_sweep_is_opened_and_not_computed(
     reference: Any, scene: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("eomc.sweeps.engines.run_block", None)
+    monkeypatch.setattr("eomc.sweeps.sweep.run_block", None)
     store = Path(reference.encoding["source"])
     assert are_equal(reference, sweep(scene, **SWEEP, out=store))
 

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from eomc.runtime.balance import Balance
     from eomc.runtime.estimate import Estimate
     from eomc.runtime.trajectory import Trajectory
-    from eomc.sweeps.engines import SweepProgress
     from eomc.sweeps.plan import SweepArguments
+    from eomc.sweeps.sweep import SweepProgress
 
 
 # hints for options of other programs
@@ -569,8 +569,7 @@ def _read_draw(option: str) -> tuple[str, dict[str, list[float]]]:
 def _run_sweep(command: SimpleNamespace, arguments: SweepArguments) -> None:
     """Run a sweep, or print its status; then draw, export and print what the options name."""
     from eomc.sweeps import store
-    from eomc.sweeps.engines import Execution
-    from eomc.sweeps.sweep import prepare_sweep, run_sweep
+    from eomc.sweeps.sweep import Execution, prepare_sweep, run_sweep
 
     options.check_target(command.plot, (".png", ".pdf", ".svg"), "--plot")
     if command.workers is not None and command.scheduler is not None:
