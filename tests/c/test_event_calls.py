@@ -112,3 +112,8 @@ def test_calls_have_a_status_that_says_what_happened(
     lines = run("./calls", cwd=tmp_path).stdout.splitlines()
     accumulated = ["whole 4 1", "steps 4 1", "plastic 4 1", "steps 4 1", "nearly 4 1"]
     assert lines == ["early 6 1", "batch 6 1", "room 6 1", "time 0 1", *accumulated]
+
+
+def test_header_states_direction_and_action_of_an_event() -> None:
+    header = eomc.sources(from_scene(parse(BALL, "ball.toml"))).files["ball.h"]
+    assert "    BALL_EVENT_IMPACT, /* falling, jump */\n" in header

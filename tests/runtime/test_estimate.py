@@ -371,7 +371,7 @@ def test_inputs_are_constant_over_the_same_intervals_in_shorter_steps(driven: Mo
 
 
 def test_step_beyond_the_stability_limit_is_reported_once(spring: Any) -> None:
-    """RK4 of an undamped spring is stable up to h omega = 2.83; verify both sides of the limit."""
+    """RK4 of an undamped spring is stable up to h omega = 2.82; verify both sides of the limit."""
     module = spring
     message = r"h = 0.03 s is beyond rk4's stability limit of about 0.028 s here \(fastest mode 100"
     with pytest.warns(RuntimeWarning, match=message):
@@ -387,7 +387,7 @@ def test_step_beyond_the_stability_limit_is_reported_once(spring: Any) -> None:
 
 
 def test_fast_decay_has_a_stability_limit_too(spring: Any) -> None:
-    """x'' = -k x - 1000 x': the fast eigenvalue is -1000 1/s, RK4's limit 2.79."""
+    """x'' = -k x - 1000 x': the fast eigenvalue is -1000 1/s, RK4's limit 2.78."""
     options = {"params": {"k": 1.0, "c": 500.0}}
     assert "limit of about 0.0028 s here (fastest decay 1e+03 1/s" in spring.advice(
         h=0.003, **options

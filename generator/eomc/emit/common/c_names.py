@@ -165,8 +165,16 @@ class Target:
 
     @cached_property
     def events(self) -> tuple[Item, ...]:
-        """The events."""
-        return tuple(self._item(x, "EVENT_") for x in self.system.events)
+        """The events; their explanations begin with direction and action."""
+        items = [
+            (self._item(x, "EVENT_"), f"{x.direction}, {x.action}") for x in self.system.events
+        ]
+        return tuple(
+            replace(
+                item, explanation=FreeText(", ".join(filter(None, (kind, item.explanation.text))))
+            )
+            for item, kind in items
+        )
 
     @cached_property
     def parameters(self) -> tuple[Item, ...]:
