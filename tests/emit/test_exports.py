@@ -386,6 +386,16 @@ def test_errors_of_jax_name_the_argument_or_the_state() -> None:
 
 
 @pytest.mark.slow
+def test_batches_of_jax_take_the_first_explicit_method() -> None:
+    """Scenes without parameters have gradients of size 0 by them."""
+    implicit = FALLS.replace("falls", "implicit") + '[run]\nmethod = ["gauss4", "dp8"]\n'
+    package, jax = jax_package(implicit)
+    assert tuple(package.model.methods) == ("dp8",)
+    gradient = jax.grad(lambda p: package.step([1.0], [2.0], p=p)[0][0])(np.zeros(0))
+    assert gradient.shape == (0,)
+
+
+@pytest.mark.slow
 def test_time_advances_in_runs_of_jax_and_has_no_derivative() -> None:
     package, jax = jax_package("kapitza_pendulum")
     value, gradient = jax.value_and_grad(

@@ -46,10 +46,13 @@ def differentiable(system: System, library: str, h: float | None) -> System:
             "and dampers; eomc export fmu includes events"
         )
         raise SceneError([system.problem("event.1", why)])
-    run = replace(system.run, linearize="products", discretize=True, real="double")
-    if library != "casadi":  # many states at once, which implicit methods do not have
+    run = replace(
+        system.run, linearize="products", discretize=True, real="double", tolerance=None,
+        batch=library != "casadi",
+    )  # fmt: skip
+    if run.batch:  # many states at once, which implicit methods do not have
         explicit = tuple(m for m in run.methods if not METHODS[m].implicit)
-        run = replace(run, methods=explicit or ("rk4",), tolerance=None, batch=True)
+        run = replace(run, methods=explicit or ("rk4",))
     return replace(system, run=run if h is None else replace(run, h=h))
 
 
