@@ -106,8 +106,7 @@ def library_texts(model: SolverModel, roots: Sequence[str] = ()) -> tuple[str, .
 
 def integrate(model: SolverModel) -> str:
     """Return the definition of the function for a run to a given time."""
-    most = max_events_per_step(model.functions.target.system)
-    return show("c/integrate.c", model.functions, model=model, max_events=most)
+    return show("c/integrate.c", model.functions, model=model)
 
 
 def library_names(model: SolverModel) -> Names:
@@ -178,11 +177,6 @@ def tables(functions: SceneFunctions) -> tuple[str, ...]:
     )
 
 
-def max_events_per_step(system: System) -> int:
-    """Return the number of events in one step at which the step is ended early."""
-    return EVENTS_PER_STEP + sum(e.begins is not None for e in system.events)
-
-
 def steps_in_parallel(target: Target) -> bool:
     """Return True if optimised C steps several instances of a batch together in vector registers.
 
@@ -223,12 +217,10 @@ def header(functions: SceneFunctions, workspace: int = 0, width: int = 0) -> str
         functions,
         workspace=max(workspace, adaptive_workspace),
         in_parallel=not functions.is_portable and steps_in_parallel(target),
-        max_events=max_events_per_step(s),
     )
 
 
 SAMPLES = 9  # values of an event function in a step
-EVENTS_PER_STEP = 32  # without events at the same time
 DIRECTIONS = {"falling": -1, "both": 0, "rising": 1}
 
 COMMENTS = {  # of the tables of integers, by name
@@ -248,8 +240,8 @@ def sizes(functions: SceneFunctions) -> dict[str, str]:
     initial = sum(e.begins is not None for e in system.events)
     return {
         "EOM_SAMPLES": str(SAMPLES),
-        "EOM_MAX_EVENTS": str(EVENTS_PER_STEP + initial),
-        "EOM_MAX_SIMULTANEOUS": str(EVENTS_PER_STEP + 4 * initial),
+        "EOM_MAX_EVENTS": str(target.max_events_per_step),
+        "EOM_MAX_SIMULTANEOUS": str(target.max_events_per_step + 3 * initial),
         "EOM_OWN_EVENTS": str(len(system.own_events)),
         "EOM_MODES": str(len(system.modes)),
         "EOM_CLOSE": target.literal(1e-10 if is_double else 1e-5),

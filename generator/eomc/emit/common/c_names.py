@@ -87,6 +87,9 @@ class Item:
     value: float = 0.0
 
 
+EVENTS_PER_STEP = 32  # without events at the same time
+
+
 @dataclass(frozen=True)
 class Target:
     """A program together with the C type of its numbers, and the names that it has in C.
@@ -290,6 +293,11 @@ class Target:
     def integrates(self) -> bool:
         """Whether the source has the function for runs with adaptive steps or events."""
         return self.is_adaptive or bool(self.system.events)
+
+    @property
+    def max_events_per_step(self) -> int:
+        """Number of events in one step at which the step is ended early."""
+        return EVENTS_PER_STEP + sum(e.begins is not None for e in self.system.events)
 
     @cached_property
     def driven(self) -> bool:
