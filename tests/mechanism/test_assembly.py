@@ -360,7 +360,7 @@ def test_system_without_freedom_is_accepted_with_a_warning() -> None:
     assert "nothing moves: a structure" in str(system.warnings[0])
     driven = assembled(scene("x = { guess = true }", 'drive = "x - sin(t)"'))
     assert [w.severity for w in driven.warnings] == ["note", "note"]
-    assert "the rows alone decide the motion in time" in str(driven.warnings[0])
+    assert "the constraints determine the motion in time" in str(driven.warnings[0])
 
 
 def test_changed_initial_values_are_reported() -> None:
