@@ -31,7 +31,7 @@ PAGES = {
     for file in sorted(DOCS.rglob("*.md"))
     if file.parent.name != "tutorials" and file.relative_to(ROOT).as_posix() not in OTHERS
 }
-PACKAGES = ("casadi", "fmpy", "scipy", "matplotlib", "xarray", "pandas", "zarr")
+PACKAGES = ("casadi", "jax", "torch", "fmpy", "scipy", "matplotlib", "xarray", "pandas", "zarr")
 Setup = dict[str, Callable[[], Any]]
 
 
