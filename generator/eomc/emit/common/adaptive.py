@@ -141,7 +141,7 @@ def features(functions: SceneFunctions) -> dict[str, bool]:
         "EVENTS": bool(system.events),
         "SEVERAL": len(system.events) > 1,
         "JUMPS": "jumps" in program,
-        "SWITCHES": any(switches(system)),
+        "SWITCHES": any(switches(functions.target)),
         "ONLY_JUMPS": all(e.action == "jump" for e in system.events),
         # Events that are ignored where their functions are zero in a whole step, within rounding
         "RECORDS": functions.target.is_adaptive
@@ -264,7 +264,7 @@ def event_tables(functions: SceneFunctions) -> tuple[str, ...]:
         integers["mode"] = [(m.at, m.of) for m in system.modes]
     if system.own_events:
         integers["jump_sets"] = _jump_flags(target)
-    if any(flags := switches(system)):
+    if any(flags := switches(target)):
         integers["switch"] = [int(flag) for flag in flags]
     return (
         *(c.define_int_table(f"eom_{name}", row, COMMENTS[name]) for name, row in integers.items()),
@@ -274,8 +274,9 @@ def event_tables(functions: SceneFunctions) -> tuple[str, ...]:
     )
 
 
-def switches(system: System) -> list[bool]:
+def switches(target: Target) -> list[bool]:
     """Return for each coordinate whether jumps set it and the motion or an event depends on it."""
+    system = target.system
     jumped = {name for e in system.events for name, _ in e.jump}
     formulas = (
         system.kinetic, system.potential, system.linear_potential, system.dissipation,
@@ -283,8 +284,9 @@ def switches(system: System) -> list[bool]:
         *(e for _, e in system.definitions), *(c.formula for c in system.constraints),
         *(u.signal for u in system.inputs), *(e.when for e in system.events),
     )  # fmt: skip
-    symbols = {symbol for e in formulas for symbol in e.free_symbols}
-    return [c.name in jumped and c.q in symbols for c in system.coordinates]
+    used = {symbol.name for e in formulas for symbol in e.free_symbols}
+    names = (target.scene_name(c.name) for c in system.coordinates)
+    return [name in jumped and name in used for name in names]
 
 
 def _jump_flags(target: Target) -> list[list[int]]:
