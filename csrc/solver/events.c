@@ -166,10 +166,9 @@ static int eom_sample_events(eom_event_samples *samples, eom_run_state *s, const
         eom_event_samples *const e = &samples[k];
 
         e->largest = eom_fabs(e->g[0]);
-#if EOM_JUMPS
-        e->change = e->from = e->is_driven = 0;
-#else
         e->change = e->from = 0;
+#if EOM_JUMPS
+        e->is_driven = 0;
 #endif
         for (int j = 0; j < EOM_SAMPLES; j++)
             if (e->g[j] != e->g[j])

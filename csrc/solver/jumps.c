@@ -84,7 +84,7 @@ static int eom_update_accumulation(eom_run_state *s, const eom_root *x, const eo
     eom_event_state *const e = &s->event[x->k];
     const real t = eom_fabs(x->t), elapsed = x->t - e->jump_time, last = e->interval;
     const real interval = elapsed > SAME_TIME*t ? elapsed : 0, ratio = interval < last ? interval/last : 1;
-    const real remaining_time = interval*ratio/(1 - ratio); /* unused if ratio = 1 */
+    const real remaining_time = ratio < 1 ? interval*ratio/(1 - ratio) : 0;
     const int interval_vanishes = ratio > (real)1e-6 && ratio < 1 && (remaining_time <= 4*EOM_EPS*t || interval <= 64*EOM_EPS*t);
     const int is_low = elapsed <= 4*(x->t - s->t0) && ratio*ratio*x->height <= 16*eom_event_rounding(x->k, x->q, x->qd, x->t, m);
 
@@ -101,7 +101,7 @@ static int eom_update_accumulation(eom_run_state *s, const eom_root *x, const eo
         e->interval = interval;
         s->h = s->h > 2*interval ? 2*interval : s->h;
     }
-    output->limit = s->simultaneous_jumps || !(ratio < 1) ? x->t : x->t + remaining_time;
+    output->limit = s->simultaneous_jumps ? x->t : x->t + remaining_time;
 #if EOM_MODES
     return s->simultaneous_jumps >= EOM_MAX_SIMULTANEOUS || interval_vanishes || (x->k < EOM_OWN_EVENTS && (x->hidden || is_low));
 #else

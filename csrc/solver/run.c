@@ -18,7 +18,7 @@ static void eom_store_times(eom_output *output, const eom_options *options, cons
         real *const q = output->q_rows + EOM_NQ*output->rows, *const qd = output->qd_rows + EOM_NQ*output->rows;
 #if EOM_ADAPTIVE
         const int at_end = time == s->t && s->t_rest == 0;
-        const real z = (time - s->t0 - s->t0_rest)/s->size;
+        const real z = at_end ? 1 : (time - s->t0 - s->t0_rest)/s->size;
 #else
         const int at_end = time == s->t;
 #endif
