@@ -28,10 +28,10 @@ static eom_status eom_differentiate_accelerations(real *J, const real *q, const 
 #endif
 #if EOM_PARAMETERS
     enum { NP = EOM_NP };
-    real E[NQ*NP];
+    real E[(int)NQ*NP];
 #endif
 #if EOM_SIGNAL_PARAMETERS
-    real u_p[NU*NP];
+    real u_p[(int)NU*NP];
 #endif
 
     if (status)
