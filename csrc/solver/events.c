@@ -88,8 +88,8 @@ static real eom_evaluate_event(int k, real z, const eom_run_state *s, const eom_
 /*
  * The sign that event function k has after the start of the step: its own sign there if it is not zero. Otherwise that of
  * its first value above rounding errors at the fractions 5e-7*4^n, since a function that leaves zero may return before the
- * first node; or that at the end of the step. 0, and e->is_driven: a jump left it at zero without a rate, and
- * accelerations drive it on.
+ * first node; or that at the end of the step. 0, and e->is_driven: a jump left it at zero without a rate, and the
+ * acceleration drives it through zero again: a z + b z^2, of which 16 z, 4 z and z give b alone, is b z^2.
  */
 static int eom_leaving_sign(int k, eom_event_samples *e, const eom_run_state *s, const eom_model *m)
 #else
@@ -385,8 +385,8 @@ static void eom_move_root(eom_root *x, real z, const eom_run_state *s, const eom
 #endif
 #if EOM_JUMPS
 /*
- * Whether to accept the root x although a residual is left: values more than 64 times as large follow, and precede
- * (x->hidden: none do) unless the last jump is at most 4 times as far before the root as the start of the step.
+ * Whether to accept the root x although a residual is left: values more than 64 times as large follow it, and either
+ * such values precede it (x->hidden: none do), or the last jump is recent, at most 4 times the distance to the step's start.
  */
 #else
 /*

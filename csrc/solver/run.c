@@ -48,7 +48,7 @@ static int eom_begin_run(eom_run_state *s, const real *q, const real *qd, const 
 {
     const real t = output->has_started ? output->t : options->t0;
 #if EOM_JUMPS
-    const int has_jumped = output->has_started && t <= output->limit; /* a moment ago */
+    const int has_jumped = output->limit != 0 && t <= output->limit; /* in the previous call */
 #endif
     int warm = output->has_started && output->memory && output->memory->warm;
 
@@ -114,7 +114,7 @@ static eom_status eom_step_with_events(eom_run_state *s, const eom_options *opti
     if (status)
         return status;
     status = eom_detect_events(&x, s, m, output);
-    if (status) { /* already at the start of the step */
+    if (status) { /* discard the step: its start is the last valid state */
         eom_copy_state(s->q, s->qd, s->q0, s->qd0);
         s->t = s->t0;
         s->size = 0;

@@ -18,9 +18,10 @@ name = "ball"
 y = { start = 1.0 }
 [parameters]
 e = 0.5
+g = 9.81
 [energy]
 kinetic = "y_dot**2/2"
-potential = "9.81*y"
+potential = "g*y"
 [[event]]
 name = "impact"
 when = "y"
@@ -63,6 +64,22 @@ static void bounce(const char *what, double e, long steps)
     print(what, status, last == status && is_above && q[0] > -1e-9 && output.t - end < 1e-6);
 }
 
+/* Two calls before time zero, without a jump; the first ends where y touches zero. */
+static void rise(void)
+{
+    ball_params p = ball_defaults;
+    double q[1] = { -4.0 }, qd[1] = { 8.0 };
+    ball_options options = { .t0 = -3.0, .t_end = -2.0, .h = 0.125, .steps = 1000 };
+    ball_output output = { 0 };
+    int status;
+
+    p.g = 8.0;
+    status = (int)ball_integrate(q, qd, &p, &options, &output);
+    options.t_end = -1.5;
+    status += (int)ball_integrate(q, qd, &p, &options, &output);
+    print("rising", status, output.t > -1.6 && q[0] < -0.9);
+}
+
 int main(void)
 {
     double q[1] = { 1.0 }, qd[1] = { 0.0 }, rows[4], row[3];
@@ -98,6 +115,7 @@ int main(void)
     bounce("plastic", 0.0, 1000000);
     bounce("steps", 0.0, 1);
     bounce("nearly", 1e-8, 3);
+    rise();
     return 0;
 }
 """
@@ -123,6 +141,7 @@ def test_calls_have_a_status_that_says_what_happened(
         assert [line[:-2] for line in (lines[4], lines[6])] == ["whole 4", "plastic 4"]
         return
     accumulated = ["whole 4 1", "steps 4 1", "plastic 4 1", "steps 4 1", "nearly 4 1"]
+    accumulated.append("rising 0 1")
     assert lines == ["early 6 1", "batch 6 1", "room 6 1", "time 0 1", *accumulated]
 
 
