@@ -5,6 +5,7 @@ from __future__ import annotations
 import _thread
 import threading
 import time
+from warnings import catch_warnings, simplefilter
 
 import numpy as np
 import pytest
@@ -111,6 +112,23 @@ def test_step_beyond_the_stability_limit_of_the_first_instance_is_reported() -> 
     with pytest.warns(RuntimeWarning, match=message) as warnings:
         m.simulate_batch(h=0.012, steps=20, params={"k": [1e6, 1.0]})
     assert warnings[0].filename == __file__
+
+
+def test_many_calls_of_few_steps_beyond_the_stability_limit_are_reported_once() -> None:
+    m = module("mass_spring")
+    q, qd = np.ones((2, 1)), np.zeros((2, 1))
+    stiff = {"params": {"k": np.array([1e6, 1.0])}, "steps": 6}
+    with catch_warnings():
+        simplefilter("error")
+        for _ in range(3):
+            m.step_batch(q, qd, h=0.0125, **stiff)
+    with pytest.warns(RuntimeWarning, match="first instance: h = 0.0125 s is beyond rk4's"):
+        m.step_batch(q, qd, h=0.0125, **stiff)
+    with catch_warnings():
+        simplefilter("error")
+        m.step_batch(q, qd, h=0.0125, **stiff)
+        for _ in range(9):
+            m.step_batch(np.ones((2, 1)), np.zeros((2, 1)), h=0.0013, **stiff)
 
 
 def test_ctrl_c_stops_within_a_second_and_leaves_completed_steps() -> None:

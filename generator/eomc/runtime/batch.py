@@ -37,6 +37,7 @@ from .model import Model
 from .package import Component, warn, with_events
 from .requests import (
     FIRST_CALL_NUMBERS,
+    MIN_CHECKED_STEPS,
     Progress,
     Request,
     SimulationArguments,
@@ -529,6 +530,7 @@ class Batch(Component):
         self.count_type, self.status_type = map(self.c.ffi.typeof, ("long[]", "int[]"))
         self.outputs_type = self.c.ffi.typeof("run_output[]")
         self.step_seconds: dict[Any, float] = {}
+        self.step_counts: dict[Any, int] = {}  # of step_batch, by method and step size
 
     @cached_property
     def result_type(self) -> np.dtype[Any]:
@@ -712,7 +714,9 @@ class Batch(Component):
         method : str, optional
             Name of the method, one of `methods`; by default the first of the scene.
         steps : int
-            Number of steps.
+            Number of steps. They have the fixed size h in scenes with adaptive steps, too. After 20
+            steps of a method and a size, a warning is issued if the size exceeds the stability
+            limit at the state of the first instance.
 
         Returns
         -------
@@ -757,6 +761,16 @@ class Batch(Component):
                 raise ValueError(f"{name}: {len(rows)} instances where q has {count}")
         if threads is not None:
             as_count(threads, "threads", 1)
+        key = method or self.info.methods[0], h
+        if key not in self.model.integrator.warned and count:
+            self.step_counts[key] = self.step_counts.get(key, 0) + steps
+            if self.step_counts[key] >= MIN_CHECKED_STEPS:
+                t0 = as_number(t, "t") if times is None else float(times[0])
+                rows = self.arguments.parameter_rows(params)
+                choice = h, MIN_CHECKED_STEPS, 1, None, inputs, 0.0, 0, rows, key[0]
+                self.model.integrator.check_step_size(
+                    Request(q, qd, t0, 0.0, *choice), "the first instance: "
+                )
         if (
             count * steps >= MIN_STEPS_FOR_THREADS
             or count * steps * self.info.nq > 8 * MIN_STEPS_FOR_THREADS
