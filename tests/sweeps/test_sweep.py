@@ -409,6 +409,7 @@ def test_different_processors_are_reported(scene: Path, tmp_path: Path) -> None:
         ({}, "nothing varies"),
         ({"over": {"m": {"from": 1, "to": 1, "n": 3}}}, "from and to are both 1"),
         ({"over": {"m": [1]}, "control_period": 0.1}, "control_period: goes with noise or a"),
+        ({"over": {"m": [1]}, "keep": ["theta"]}, "keep: in Python .* outputs="),
         ({"over": {"m": [1]}, **NOISE, "control_period": 0.013}, "control_period: .* 1.3 steps"),
         ({"over": {"m": [1]}, "noise": {"torqe": {"normal": [0, 1]}}}, "did you mean 'torque'"),
         ({"over": {"m": [1]}, "noise": {"torque": {"normal": [0]}}}, "torque: normal has the"),

@@ -210,8 +210,9 @@ class Frames(Component):
     ) -> Array:  # fmt: skip
         """Return the generalized force that a motion requires: D qdd + C qd + g - sum(J^T f_ext).
 
-        It is the sum of all forces along the coordinates, including friction. Drives must supply
-        this force minus the force `tau` at u = 0. With constraints it equals tau + A^T lambda;
+        It is the sum of all forces that the motion requires. Damping, friction and the scene's
+        other forces contribute to this sum, so the drives supply the rest: inverse_dynamics(q, qd,
+        qdd) - tau(q, qd, u=np.zeros(nu)). With constraints it equals tau + A^T lambda;
         `drive_forces` separates the two terms. The evaluation is recursive and does not form D.
 
         Parameters

@@ -513,6 +513,8 @@ def _read_run(options: Mapping[str, Any]) -> dict[str, Any]:
     """Return the options of a run as plain numbers, texts and lists."""
     run = {}
     for name, value in options.items():
+        if name == "keep":
+            raise SweepError(("keep",), "in Python the stored quantities are given by outputs=")
         check_name(("run", name), name, RUN_OPTIONS, "no option of a run")
         if name == "times":
             value = read_axis(("run", "times"), value)
