@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -494,4 +495,6 @@ def test_page_about_exports_runs(
     library = {"PyTorch": "torch"}.get(section, section.lower())
     pytest.importorskip(library, reason=f"no {library}: pip install '.[{library}]'")
     monkeypatch.chdir(tmp_path)
+    if section != "CasADi":  # which writes the scene
+        shutil.copy(SCENES / "cartpole_driven.toml", tmp_path)
     run_page(section, tmp_path)
