@@ -214,17 +214,21 @@ def differentiate(
         yield differences(rates, x, width * scales), scales
 
 
-def relative_differences(values: Vector, exact: Vector, scales: Vector, size: Vector) -> Vector:
+def relative_differences(
+    values: Vector, exact: Vector, scales: Vector, size: Vector, rounding: Vector | float = 0.0
+) -> Vector:
     """Return |values - exact|, (nq, k), relative to the largest scaled entry in each matrix row.
 
     Scaled means that column j of both matrices is multiplied by scales[j]. `size` (nq,) is the size
     of the terms that add up to each acceleration: 1e-4 of it is added to the divisor, since
-    difference quotients lose digits. An entry is nan if `exact` is not finite there, and inf if
-    only `values` is not.
+    difference quotients lose digits. `rounding`, (nq,) or a number, is the rounding error of the
+    scaled `exact`, which is subtracted from the difference. An entry is nan if `exact` is not
+    finite there, and inf if only `values` is not.
     """
     divisor = np.max(np.abs(exact) * scales, axis=1, initial=0) + 1e-4 * size
     with np.errstate(all="ignore"):
-        difference = np.abs(values - exact) * scales / divisor[:, None]
+        beyond = np.abs(values - exact) * scales - np.reshape(rounding, (-1, 1))
+        difference = np.maximum(beyond, 0) / divisor[:, None]
     difference = np.where(values == exact, 0, difference)
     return np.asarray(
         np.where(np.isfinite(exact), np.where(np.isfinite(values), difference, np.inf), np.nan)
@@ -417,15 +421,17 @@ def _step_error(
         # inputs may change a coordinate by 1e-4 of its scale in a step; less is not judged
         ends, size = np.cumsum([x.shape[1] for x in derivatives]), 1e-4 * scales[: 2 * n]
         parts = [slice(end - x.shape[1], end) for end, x in zip(ends, derivatives, strict=True)]
-        off = [
-            np.hstack(
-                [
-                    relative_differences(x, J[:, i], scales[i], size)
-                    for x, i in zip(derivatives, parts, strict=True)
-                ]
+        off = []
+        for J, width in zip(near, WIDTHS, strict=True):
+            # the step's end has rounding errors of the largest terms that add up to it
+            largest = np.max(np.abs(J) * scales, axis=1) + scales[: 2 * n]
+            rounding = 8 * np.finfo(float).eps * largest / width
+            blocks = zip(derivatives, parts, strict=True)
+            off.append(
+                np.hstack(
+                    [relative_differences(x, J[:, i], scales[i], size, rounding) for x, i in blocks]
+                )
             )
-            for J in near
-        ]
         return float(np.nan_to_num(np.max(np.fmin.reduce(off)), nan=math.inf))
     return None
 
