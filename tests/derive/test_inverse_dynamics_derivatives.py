@@ -340,7 +340,13 @@ def by_forward_differentiation(name: str) -> tuple[System, Function]:
     return system, functions(system)["forward"]
 
 
-@pytest.mark.parametrize(("old", "new"), MUTANTS)
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        pytest.param(*mutant, marks=() if k % 6 == 0 else pytest.mark.slow)
+        for k, mutant in enumerate(MUTANTS)
+    ],
+)
 def test_each_term_of_the_derivatives_is_tested(old: str, new: str) -> None:
     """The comparison fails where a term is left out or has another sign or factor."""
     source = inspect.getsource(inverse_dynamics_derivatives)
