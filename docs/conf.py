@@ -31,6 +31,7 @@ numpydoc_show_class_members = False
 html_theme = "pydata_sphinx_theme"
 html_title = "eomc"
 html_math_renderer = "mathml"  # formulas are shown without a script from elsewhere
+html_static_path = ["site/static"]
 html_show_sourcelink = False
 html_sidebars = {"README": []}
 html_theme_options = {

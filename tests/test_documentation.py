@@ -12,7 +12,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-from support.session import ROOT
+from support.session import ROOT, needs
 
 import eomc
 from eomc.base import resources
@@ -86,29 +86,53 @@ def test_equations_of_a_scene_are_in_the_gallery(pages: ModuleType, tmp_path: Pa
     assert (tmp_path / "a.svg").read_text(encoding="utf-8").startswith("<?xml")
 
 
-@pytest.mark.slow
-def test_site_is_built_without_warnings(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The site, built without warnings."""
     for package in ("sphinx", "myst_nb", "numpydoc", "pydata_sphinx_theme", "sphinx_click"):
         pytest.importorskip(package, reason=f"{package} is not installed: pip install '.[docs]'")
+    folder = tmp_path_factory.mktemp("docs")
     command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html"]
     process = subprocess.run(
-        [*command, "-d", tmp_path / "cache", DOCS, tmp_path / "site"],
-        capture_output=True, text=True,
-    )  # fmt: skip
+        [*command, "-d", folder / "cache", DOCS, folder / "site"], capture_output=True, text=True
+    )
     assert process.returncode == 0, process.stderr
-    site = tmp_path / "site"
+    return folder / "site"
+
+
+@pytest.mark.slow
+def test_site_loads_nothing_from_elsewhere(site: Path) -> None:
     for page in site.rglob("*.html"):
         text = page.read_text(encoding="utf-8")
         loaded = re.findall(
             r"<(?:script|link|img|iframe)[^>]* (?:src|href)=\"(https?:[^\"]*)", text
         )
         assert not loaded, f"{page.name} loads {loaded} from elsewhere"
-        images = re.findall(r'<img[^>]* src="([^"]+)"', text)
+        images = re.findall(r'<img[^>]* src="(?!data:)([^"]+)"', text)
         assert all((page.parent / image).exists() for image in images), page.name
     text = (site / "searchindex.js").read_text(encoding="utf-8")
     index = json.loads(text.removeprefix("Search.setIndex(").removesuffix(")"))
-    # terms are stems; names of functions are found as objects too
-    assert {"arm_inverse_dynam", "friction_width", "embed", "linear"} <= set(index["terms"])
     objects = {f"{part}.{row[4]}" for part, rows in index["objects"].items() for row in rows}
     assert {".arm_integrate", "eomc.load"} <= objects
     assert (site / "index.html").is_file()
+    search = (site / "search.html").read_text(encoding="utf-8")
+    for script in re.findall(r'<script defer="defer" src="(_static/[^"?]+)', search):
+        assert (site / script).is_file()
+
+
+@pytest.mark.slow
+def test_first_result_of_a_search_answers_the_task(site: Path) -> None:
+    needs("node")
+    lines = (ROOT / "tests" / "site_searches.txt").read_text(encoding="utf-8").splitlines()
+    tasks = dict(line.split(" | ") for line in lines if " | " in line and line[0] != "#")
+    process = subprocess.run(
+        ["node", ROOT / "tests" / "support" / "search_site.js", site / "_static"],
+        input="\n".join(tasks), capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    firsts = [(pages or ["nothing"])[0].partition("#")[0] for pages in json.loads(process.stdout)]
+    wrong = {
+        task: first
+        for (task, right), first in zip(tasks.items(), firsts, strict=True)
+        if first not in right.split()
+    }
+    assert len(wrong) <= 0.25 * len(tasks), wrong

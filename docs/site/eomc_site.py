@@ -5,13 +5,16 @@
 - Links to files of the repository that are no pages of the site become their paths.
 - Directives write what is generated: `scene-keys`, `gallery` and `c-functions`.
 - Formulas are MathML, which needs no script.
+- The search ranks sections (static/search.js), also by the terms of the glossary that lead to them.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import posixpath
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +25,8 @@ from sphinx.util.docutils import SphinxDirective
 
 ROOT = Path(__file__).parents[2]
 SECTIONS = ("README", "tutorials", "how-to", "reference", "explanation")
+# generated pages and those for developers are less often what a user looks for
+SEARCH_WEIGHTS = {"reference/": 0.7, "explanation": 0.6, "glossary": 0.8}
 LISTED = re.compile(r"^- \[[^\]]*\]\((?!\.\.)([^)#:]+)\.(?:md|ipynb)\)", re.MULTILINE)
 LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s#:]+)(#[^)\s]*)?\)")
 CODE = re.compile(r"(^```.*?^```)", re.MULTILINE | re.DOTALL)
@@ -115,11 +120,66 @@ def write_front_page(app: Sphinx, error: Exception | None) -> None:
         (first.parent / "index.html").write_text(first.read_text(encoding="utf-8"), "utf-8")
 
 
+def write_sections(app: Sphinx, error: Exception | None) -> None:
+    """Write the sections of the pages for the search: page, anchor, titles, names and text."""
+    if error is not None or app.builder.format != "html":
+        return
+    names: dict[str, list[str]] = {}
+    for page in (*SECTIONS, "glossary"):
+        tree = app.env.get_and_resolve_doctree(page, app.builder)
+        for target, name in _find_names(tree, page):
+            names.setdefault(target, []).append(name)
+    sections = []
+    for page in sorted(app.env.found_docs - set(SECTIONS)):
+        title = app.env.titles[page].astext()
+        kind = "explanation" if page in app.env.toctree_includes["explanation"] else page
+        weight = next((w for name, w in SEARCH_WEIGHTS.items() if kind.startswith(name)), 1)
+        for section in app.env.get_doctree(page).findall(nodes.section):
+            anchor = "" if section.parent.parent is None else section["ids"][0]
+            heading, *body = (each for each in section if not isinstance(each, nodes.section))
+            text = "" if page == "glossary" else " ".join(_text(each) for each in body)
+            known = names.get(f"{page}.html" + (f"#{anchor}" if anchor else ""), [])
+            sections.append([page, anchor, title, heading.astext(), known, text, weight])
+    file = Path(app.outdir, "_static", "sections.js")
+    file.write_text(f"const siteSections = {json.dumps(sections, ensure_ascii=False)};\n", "utf-8")
+
+
+def _find_names(tree: nodes.document, page: str) -> Iterator[tuple[str, str]]:
+    """Yield the targets and the names that tables of terms and lists of pages give to them."""
+    for row in tree.findall(nodes.row):
+        links = [link["refuri"] for link in row.findall(nodes.reference)]
+        if not links and isinstance(section := row.parent.parent.parent.parent, nodes.section):
+            links = [f"{page}.html#{section['ids'][0]}"]  # what eomc does not have
+        for link in links:
+            yield from ((link, name) for name in _text(row[0]).split(","))
+    for item in tree.findall(nodes.list_item):
+        link = next(iter(item.findall(nodes.reference)), None)
+        if link is not None:
+            title, _, words = _text(item).partition(":")
+            yield from ((link.get("refuri", ""), name) for name in (title, *words.split(",")))
+
+
+def _text(node: nodes.Node) -> str:
+    """Return the text of a node without HTML."""
+    return " ".join(
+        each.astext() for each in node.findall(nodes.Text) if not isinstance(each.parent, nodes.raw)
+    )
+
+
+def load_search(app: Sphinx, page: str, *_: Any) -> None:
+    """Let the page of the search load our scripts after those of Sphinx."""
+    if page == "search":
+        for name in ("sections.js", "search.js"):
+            app.add_js_file(name, loading_method="defer")
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Register the parts of the extension."""
     app.connect("source-read", read_page)
     app.connect("sphinx-click-process-description", show_examples)
     app.connect("build-finished", write_front_page)
+    app.connect("build-finished", write_sections)
+    app.connect("html-page-context", load_search)
     app.add_directive("scene-keys", SceneKeys)
     app.add_directive("gallery", Gallery)
     app.add_directive("c-functions", CFunctions)
