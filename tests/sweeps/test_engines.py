@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import os
 import pickle
+import re
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable
-from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
+from concurrent.futures import (
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+)
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -47,6 +55,18 @@ class InlineExecutor(Executor):
         return future
 
 
+class CountingExecutor(ThreadPoolExecutor):
+    """A pool of threads that counts the tasks in work."""
+
+    most = 0
+
+    def submit(self, function: Any, /, *arguments: Any, **options: Any) -> Future[Any]:
+        future = super().submit(function, *arguments, **options)
+        self.futures = [f for f in (*getattr(self, "futures", ()), future) if not f.done()]
+        self.most = max(self.most, len(self.futures))
+        return future
+
+
 def ends(runs: Any) -> dict[str, Any]:
     return {"theta": runs["theta"][:, -1], "theta_dot": runs["theta_dot"][:, -1]}
 
@@ -62,6 +82,12 @@ def test_an_executor_gives_the_same_bits(reference: Any, scene: Path, tmp_path: 
     executor = InlineExecutor()
     dataset = sweep(scene, **SWEEP, block=256, client=executor, out=tmp_path / "a.zarr")
     assert are_equal(reference, dataset) and executor.numbers == [0, 1, 2, 3, 4]
+
+
+def test_four_blocks_for_each_worker_are_submitted_at_a_time(scene: Path, tmp_path: Path) -> None:
+    with CountingExecutor(1) as executor:
+        sweep(scene, **SWEEP | {"n": 2000}, block=256, client=executor, out=tmp_path / "a.zarr")
+    assert executor.most <= 4
 
 
 def test_a_block_that_kills_its_workers_is_left_out(scene: Path, tmp_path: Path) -> None:
@@ -116,8 +142,9 @@ def test_dask_in_this_process(reference: Any, scene: Path, tmp_path: Path) -> No
         distributed.LocalCluster(**options, dashboard_address=None) as cluster,
         distributed.Client(cluster) as client,
     ):
-        dataset = sweep(scene, **SWEEP, block=256, client=client, out=tmp_path / "a.zarr")
-    assert are_equal(reference, dataset)
+        for name, engine in (("a", client), ("b", cluster.scheduler_address)):
+            dataset = sweep(scene, **SWEEP, block=256, client=engine, out=tmp_path / name)
+            assert are_equal(reference, dataset)
 
 
 def test_missing_scheduler_is_reported(scene: Path, tmp_path: Path) -> None:
@@ -151,6 +178,95 @@ def test_processes_give_the_same_bits_and_a_poisoned_block_is_left_out(
         )
     not_run = (dataset["status"] == NOT_RUN).all("draw")
     assert not_run.values.tolist() == [m == 8 for m in range(1, 13)]
+
+
+def start_executor(name: str) -> Any:
+    """Return an executor of three processes."""
+    if name == "concurrent.futures":
+        return ProcessPoolExecutor(3, get_context("spawn"))
+    if name == "loky":
+        return pytest.importorskip("loky").get_reusable_executor(3)
+    if name == "distributed":
+        distributed = pytest.importorskip("distributed")
+        options = {"n_workers": 3, "threads_per_worker": 1, "dashboard_address": None}
+        return distributed.Client(**options).get_executor(pure=False)
+    pytest.importorskip("mpi4py")
+    try:
+        from mpi4py.futures import MPIPoolExecutor
+    except RuntimeError as fault:
+        pytest.skip(f"needs an MPI library: {fault}")
+    return MPIPoolExecutor(3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["concurrent.futures", "loky", "distributed", "mpi4py"])
+def test_each_executor_gives_the_same_bits(
+    name: str, reference: Any, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All workers begin with a build, at the same time."""
+    monkeypatch.setenv("EOMC_CACHE", str(tmp_path / "cache"))
+    with start_executor(name) as executor:
+        dataset = sweep(scene, **SWEEP, block=256, client=executor, out=tmp_path / "a.zarr")
+    assert are_equal(reference, dataset)
+    assert len([*tmp_path.glob("cache/sweeps/*/sweep_pendulum/build.json")]) == 1
+
+
+def set_variables(values: dict[str, str]) -> None:
+    os.environ.update(values)
+
+
+@pytest.mark.slow
+def test_a_worker_without_a_compiler_is_named(scene: Path, tmp_path: Path) -> None:
+    environment = {"EOMC_CACHE": str(tmp_path / "cache"), "CC": "missing-compiler"}
+    with (
+        ProcessPoolExecutor(1, get_context("spawn"), set_variables, (environment,)) as pool,
+        pytest.raises(EomcError, match=r"worker .*:\d+: .*missing-compiler"),
+    ):
+        sweep(scene, over={"m": [1, 2]}, client=pool, out=tmp_path / "a.zarr")
+
+
+SMALL_DISC = """
+import subprocess, sys
+from pathlib import Path
+from eomc.base.errors import EomcError
+from eomc.sweeps.store import Store
+from eomc.sweeps.sweep import sweep
+scene, folder, copy = sys.argv[1:]
+def mount(*options):
+    subprocess.run(["mount", "-t", "tmpfs", *options, "none", folder], check=True)
+def run():
+    sweep(scene, draws={draws!r}, n=100_000, block=4096, threads=1, out=Path(folder, "a.zarr"))
+mount("-o", "size=1m")
+try:
+    run()
+except EomcError as fault:
+    print(fault, int(Store(Path(folder, "a.zarr")).finished().sum()))
+mount("-o", "remount,size=100m")
+run()
+subprocess.run(["cp", "-r", Path(folder, "a.zarr"), copy], check=True)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("unshare") is None, reason="needs the program unshare")
+def test_a_sweep_goes_on_when_a_small_file_system_has_room(scene: Path, tmp_path: Path) -> None:
+    own = ["unshare", "--map-root-user", "--mount"]
+    (tmp_path / "disc").mkdir()
+    if subprocess.run(
+        [*own, "mount", "-t", "tmpfs", "none", tmp_path / "disc"], check=False
+    ).returncode:
+        pytest.skip("mounts no file system")
+    run = [sys.executable, "-c", SMALL_DISC.format(draws=SWEEP["draws"])]
+    folders = [str(scene), str(tmp_path / "disc"), str(tmp_path / "a.zarr")]
+    result = subprocess.run([*own, *run, *folders], capture_output=True, text=True, check=False)
+    assert re.match(r"no room left on the disc: (\d+) of 25 .* run it again \1$", result.stdout), (
+        result
+    )
+    again, whole = (
+        sweep(scene, **SWEEP | {"n": 100_000}, block=4096, out=tmp_path / name)
+        for name in ("a.zarr", "b.zarr")
+    )
+    assert are_equal(again, whole)
 
 
 @pytest.mark.slow

@@ -211,6 +211,13 @@ def test_parts_make_the_whole(reference: Any, scene: Path, tmp_path: Path) -> No
     assert are_equal(reference, sweep(scene, **arguments))
 
 
+def test_reductions_of_finished_blocks_alone_are_reported(scene: Path, tmp_path: Path) -> None:
+    arguments = SWEEP | {"block": 256, "reduce": {"theta": "mean"}, "out": tmp_path / "a.zarr"}
+    with pytest.warns(RuntimeWarning, match="2 of 5 blocks .*; reductions are of these alone"):
+        dataset = sweep(scene, **arguments, part=(1, 3))
+    assert dataset["theta_count"] == 512
+
+
 def test_failed_trajectories_are_nan_and_counted(scene: Path, tmp_path: Path) -> None:
     draws = {"l": {"log_uniform": [1e-250, 1]}}
     with pytest.warns(RuntimeWarning, match=r"of 500 trajectories failed \(\d+ "):
@@ -219,6 +226,17 @@ def test_failed_trajectories_are_nan_and_counted(scene: Path, tmp_path: Path) ->
     assert 0 < failed.sum() < 500
     assert np.isnan(dataset["theta"].values[failed]).all()
     assert np.isfinite(dataset["theta"].values[~failed]).all()
+
+
+@pytest.mark.slow  # builds adaptive steps
+def test_a_limit_of_evaluations_ends_long_trajectories(tmp_path: Path) -> None:
+    file = tmp_path / "sweep_adaptive.toml"
+    text = SCENE.replace("h        = 0.01", "tolerance = 1e-9").replace("sweep_pendulum", file.stem)
+    file.write_text(text, encoding="utf-8")
+    arguments: dict[str, Any] = {"over": {"theta_dot": [1.0, 1e5]}, "out": tmp_path / "a.zarr"}
+    with pytest.warns(RuntimeWarning, match=r"1 of 2 trajectories failed \(1 too long\)"):
+        dataset = sweep(file, **arguments, max_evaluations=2000)
+    assert np.isfinite(dataset["theta"]).values.tolist() == [True, False]
 
 
 # --- what varies, what is stored ------------------------------------------------------------------
@@ -322,6 +340,12 @@ def test_the_store_of_another_sweep_is_refused(
 ) -> None:
     with pytest.raises(EomcError, match=rf"holds another sweep: .*\n  {difference}"):
         sweep(scene, **{**SWEEP, **change}, out=reference.encoding["source"])
+
+
+def test_the_store_of_another_text_of_the_scene_is_refused(reference: Any, tmp_path: Path) -> None:
+    (tmp_path / "sweep_pendulum.toml").write_text(f"{SCENE}# changed\n", encoding="utf-8")
+    with pytest.raises(EomcError, match=r"another sweep: .*\n  scene: another text there"):
+        sweep(tmp_path / "sweep_pendulum.toml", **SWEEP, out=reference.encoding["source"])
 
 
 def test_a_missing_package_is_named(
@@ -428,6 +452,7 @@ def test_different_processors_are_reported(scene: Path, tmp_path: Path) -> None:
         ({"draws": {"m": {"normal": ["a", 1]}}, "n": 3}, r"\[mean, deviation\]"),
         ({"draws": {"m": {"normal": [1]}}, "n": 3}, r"\[mean, deviation\]"),
         ({"draws": DRAWS, "n": 10**8, "sampler": "latin"}, 'take "sobol"'),
+        ({"draws": DRAWS, "n": 2**30 + 1, "sampler": "sobol"}, r"end at 2\*\*30: take .random"),
         ({"draws": DRAWS, "n": 3, "sampler": "sobel"}, "did you mean 'sobol'"),
         ({"over": {"m": [1]}, "outputs": ["height.mx"]}, "max, min, end"),
         ({"over": {"m": [1]}, "outputs": ["hight"]}, "did you mean 'height'"),

@@ -168,8 +168,11 @@ def test_the_examples_of_the_documentation_run(tmp_path: Path) -> None:
     result = call(str(examples / "bifurcation.toml"), *few)
     assert result.exit_code == 0, result.output
     arm = runpy.run_path(str(examples / "arm.py"))
-    errors = arm["main"](n=256, out=tmp_path / "c.zarr")["tip_error"].values
-    assert 0.05 < np.median(errors) < 0.07
+    dataset = arm["main"](n=256, out=tmp_path / "c.zarr", picture=tmp_path / "c.png")
+    assert 0.05 < np.median(dataset["tip_error"].values) < 0.07
+    assert len([*tmp_path.glob("?.png")]) == 3
+    for name in ("basin", "bifurcation", "arm"):
+        assert f"(examples/sweeps/{name}.png)" in page.read_text()
 
 
 @pytest.mark.parametrize(

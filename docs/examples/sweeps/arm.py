@@ -1,11 +1,12 @@
 """Error of an arm's tip under PD control, with uncertain inertias and load: 100,000 draws.
 
-python arm.py    # writes arm.zarr here, and prints quantiles of the error
+python arm.py    # writes arm.zarr and arm.png here, and prints quantiles of the error
 """
 
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 import eomc
 
@@ -27,8 +28,8 @@ def about(value):
     return {"truncated_normal": [value, 0.1 * value, 0.5 * value, 1.5 * value]}
 
 
-def main(n=100_000, out="arm.zarr"):
-    """Run the sweep and print quantiles."""
+def main(n=100_000, out="arm.zarr", picture="arm.png"):
+    """Run the sweep, draw a histogram of the error and print quantiles."""
     dataset = eomc.sweep(
         HERE / "two_link_arm.toml",
         draws={
@@ -40,6 +41,11 @@ def main(n=100_000, out="arm.zarr"):
     for probability in (0.05, 0.5, 0.95, 0.999):
         error = float(dataset["tip_error"].quantile(probability))
         print(f"{100 * probability:5.1f} %: {1000 * error:.0f} mm")
+    figure = Figure(layout="constrained")
+    axes = figure.subplots()
+    axes.hist(1000 * dataset["tip_error"], bins=100)
+    axes.set(xlabel="error of the tip, mm", ylabel="trajectories")
+    figure.savefig(picture)
     return dataset
 
 
