@@ -37,7 +37,8 @@ def describe_keys() -> str:
         if key.short:
             parts.append(f"\n`x = 1.0` is short for `x = {{ {key.first} = 1.0 }}`.")
     parts += ["\n## Types of values\n", "| type | a value is |", "|---|---|"]
-    types = {t.name: t for t in vars(value_types).values() if isinstance(t, ValueType)}
+    public = (t for name, t in vars(value_types).items() if not name.startswith("_"))
+    types = {t.name: t for t in public if isinstance(t, ValueType)}
     parts += [f"| {t.name} | {t.words} |" for t in types.values()]
     return "\n".join(parts)
 

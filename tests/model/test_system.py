@@ -209,7 +209,7 @@ x, x_dot, u = sympy.symbols("x x_dot u")
             "real: unknown type 'quad': known are double, float",
         ),
         (("a", [x], x_dot**2), {"batch": "yes"}, "batch: must be True or False, here 'yes'"),
-        (("a", [x], x_dot**2), {"linearize": "all"}, "linearize: must be True"),
+        (("a", [x], x_dot**2), {"linearize": "all"}, "linearize: unknown value"),
         (
             ("a", [x], x_dot**2),
             {"tolerance": 0.1},

@@ -27,18 +27,15 @@ from eomc.scene.value_types import (
     ends,
     entry,
     flag,
-    frame,
     frame_selection,
     limits,
     line,
-    linearization,
     lines,
     methods,
     named_points,
     names,
     note,
     places,
-    plane_axes,
     points,
     positive,
     rotation,
@@ -54,6 +51,8 @@ from eomc.scene.value_types import (
 
 WORLD = "world"  # the inertial frame, as a parent or at the end of a spring
 REALS, FRICTIONS = ("double", "float"), ("smooth", "stick")
+LINEARIZATIONS = (True, False, "parameters", "products")
+FRAMES, PLANES = (WORLD, "body"), ("xy", "xz", "yz")
 DIRECTIONS, ACTIONS = ("both", "rising", "falling"), ("record", "stop", "jump")
 MIN_FLOAT_TOLERANCE = 5e-7  # in single precision
 DEFAULT_TOLERANCE = {"double": 1e-9, "float": 1e-5}  # of a scene with events, by its real type
@@ -249,7 +248,7 @@ class RunSettings:
     real: str = key(choice("type", REALS), "C type of all computations.", "double")
     batch: bool = key(flag, "Generate functions for many trajectories at once.", False)
     linearize: bool | str = key(
-        linearization,
+        choice("value", LINEARIZATIONS),
         "Generate derivatives of the accelerations, by parameters too, and products with vectors.",
         False,
     )
@@ -446,7 +445,9 @@ class ForceTable:
     torque: Value | tuple[Value, ...] | None = key(
         scalar_or_list, "Components of the moment; one formula in the plane.", unit="N m"
     )
-    frame: str = key(frame, "Frame along whose axes the components are given.", "world")
+    frame: str = key(
+        choice("frame", FRAMES), "Frame along whose axes the components are given.", "world"
+    )
     note: str = key(note, "Free text for people.", "")
 
 
@@ -548,7 +549,7 @@ class PictureTable:
         places, "Points whose paths are drawn over the whole simulation.", ()
     )
     axes: str = key(
-        plane_axes,
+        choice("axes", PLANES),
         "Axes to the right and upwards of a picture in the plane.",
         "",
         default_text='"xy"',

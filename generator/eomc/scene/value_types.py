@@ -77,25 +77,25 @@ def expected(words: str, value: object) -> ValueError:
     return ValueError(f"must be {words}, here {short_toml(value)}")
 
 
-def _array(items: Mapping[str, Any], least: int = 0, most: int | None = None) -> dict[str, Any]:
-    """Return the JSON Schema of an array with `least` to `most` items."""
+def array(
+    name: str, words: str, item: ValueType[T], least: int = 0, most: int | None = None
+) -> ValueType[tuple[T, ...]]:
+    """Return the type of a list of `least` to `most` values of another type, kept as a tuple."""
     bounds = {"minItems": least} if least else {}
-    return {"type": "array", "items": items, **bounds, **({"maxItems": most} if most else {})}
+    bounds |= {"maxItems": most} if most else {}
+
+    def convert(value: object) -> tuple[T, ...]:
+        if not isinstance(value, list) or not least <= len(value) <= (most or len(value)):
+            raise expected(words, value)
+        return tuple(map(item, value))
+
+    return ValueType(name, words, {"type": "array", "items": item.json_schema, **bounds}, convert)
 
 
 # --- numbers, formulas and vectors ----------------------------------------------------------------
 
-_FORMULA = {"type": ["number", "string"]}
-_VECTOR = _array(_FORMULA, 1)
-_TURN = {
-    "type": "array",
-    "items": [{"enum": ["x", "y", "z"]}, _FORMULA],
-    "minItems": 2,
-    "maxItems": 2,
-}
 
-
-@value_type("formula", "a number or a formula in quotes", _FORMULA)
+@value_type("formula", "a number or a formula in quotes", {"type": ["number", "string"]})
 def entry(value: object) -> Value:
     """Check that a value is a finite number or a formula; numbers are returned as float."""
     if isinstance(value, (str, Formula)):
@@ -107,28 +107,33 @@ def entry(value: object) -> Value:
     return float(value)
 
 
-@value_type("vector", "a list of numbers and formulas, such as [0, 1.5]", _VECTOR)
-def vector(value: object) -> tuple[Value, ...]:
-    """Convert a list of numbers and formulas to a tuple."""
-    if not isinstance(value, list) or not value:
-        raise vector.mismatch(value)
-    return tuple(map(entry, value))
+vector = array("vector", "a list of numbers and formulas, such as [0, 1.5]", entry, 1)
+points = array("two points", 'two points, such as [[0, 0], ["l", 0]]', vector, 2, 2)
+_entries = array("list", "a list of numbers and formulas", entry)
 
 
 @value_type(
     "formula or list",
     "a number or a formula, or a list of these, one for each coordinate of a joint",
-    {"anyOf": [_FORMULA, _array(_FORMULA)]},
+    {"anyOf": [entry.json_schema, _entries.json_schema]},
 )
 def scalar_or_list(value: object) -> Value | tuple[Value, ...]:
     """Convert a list of numbers and formulas to a tuple; a single value is returned as it is."""
-    return tuple(map(entry, value)) if isinstance(value, list) else entry(value)
+    return _entries(value) if isinstance(value, list) else entry(value)
+
+
+_TURN = {
+    "type": "array",
+    "items": [{"enum": ["x", "y", "z"]}, entry.json_schema],
+    "minItems": 2,
+    "maxItems": 2,
+}
 
 
 @value_type(
     "rotation",
     'a list of turns, each an axis and an angle, such as [["z", "pi/2"]]',
-    {"anyOf": [_FORMULA, _array(_TURN)]},
+    {"anyOf": [entry.json_schema, {"type": "array", "items": _TURN}]},
 )
 def rotation(value: object) -> Value | tuple[tuple[str, Value], ...]:
     """Convert an angle, or a list of turns such as [["z", "pi/2"]].
@@ -143,13 +148,13 @@ def rotation(value: object) -> Value | tuple[tuple[str, Value], ...]:
     return tuple((axis, entry(angle)) for axis, angle in value)
 
 
-_AXIS = _array({"type": "number"}, 1)
+_AXIS = {"type": "array", "items": {"type": "number"}, "minItems": 1}
 
 
 @value_type(
     "axis",
     "a list of numbers, such as [0, 0, 1]",
-    {"anyOf": [_AXIS, _array(_AXIS, 1)]},
+    {"anyOf": [_AXIS, {"type": "array", "items": _AXIS, "minItems": 1}]},
 )
 def axes(value: object) -> tuple[tuple[float, ...], ...]:
     """Convert one axis, such as [0, 0, 1], or a list of axes, to a tuple of axes."""
@@ -165,11 +170,10 @@ def _is_number(value: object) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e100
 
 
-@value_type(
-    "limits",
-    "the least and the largest value, such as [-1, 1] or [0, inf]",
-    _array(_FORMULA, 2, 2),
-)
+_PAIR = array("pair", "the least and the largest value, such as [-1, 1] or [0, inf]", entry, 2, 2)
+
+
+@value_type("limits", _PAIR.words, _PAIR.json_schema)
 def limits(value: object) -> tuple[Value | None, ...]:
     """Convert a pair of limits, such as [-1, 1] or [0, inf].
 
@@ -181,43 +185,10 @@ def limits(value: object) -> tuple[Value | None, ...]:
     return tuple(None if x in none else entry(x) for x, none in zip(value, unbounded, strict=True))
 
 
-@value_type("two points", 'two points, such as [[0, 0], ["l", 0]]', _array(_VECTOR, 2, 2))
-def points(value: object) -> tuple[tuple[Value, ...], ...]:
-    """Convert a list of two points to a tuple of two vectors."""
-    if not (isinstance(value, list) and len(value) == 2):
-        raise points.mismatch(value)
-    return tuple(map(vector, value))
-
-
 # --- names and texts ------------------------------------------------------------------------------
 
-_TEXT = {"type": "string"}
 
-
-@value_type("names", "a name in quotes, or a list of names", {"anyOf": [_TEXT, _array(_TEXT)]})
-def names(value: object) -> tuple[str, ...]:
-    """Convert a name or a list of names to a tuple."""
-    names_ = value if isinstance(value, list) else [value]
-    if not all(isinstance(name, str) for name in names_):
-        raise names.mismatch(value)
-    return tuple(names_)
-
-
-def two_names(what: str) -> ValueType[tuple[str, ...]]:
-    """Return the type of a list of two names.
-
-    what: what they name, with an example, such as 'bodies, such as ["world", "cart"]'.
-    """
-
-    def convert(value: object) -> tuple[str, ...]:
-        if len(names_ := names(value)) != 2:
-            raise ValueError(f"must name two {what}, here {short_toml(value)}")
-        return names_
-
-    return ValueType("two names", f"the names of two {what}", _array(_TEXT, 2, 2), convert)
-
-
-@value_type("text", "text in quotes", _TEXT)
+@value_type("text", "text in quotes", {"type": "string"})
 def text(value: object) -> str:
     """Check that a value is a text."""
     if isinstance(value, str):
@@ -225,16 +196,39 @@ def text(value: object) -> str:
     raise text.mismatch(value)
 
 
-@value_type("line", "text in quotes, in one line", _TEXT)
+@value_type("line", "text in quotes, in one line", text.json_schema)
 def line(value: object) -> str:
     """Check that a value is a text in one line without hidden characters."""
     return texts.checked_line(text(value))
 
 
-@value_type("text", "text in quotes", _TEXT)
+@value_type("text", "text in quotes", text.json_schema)
 def note(value: object) -> str:
     """Check that a value is a text without hidden characters."""
     return texts.checked_lines(text(value))
+
+
+_names = array("names", "a list of names", text)
+
+
+@value_type(
+    "names",
+    "a name in quotes, or a list of names",
+    {"anyOf": [text.json_schema, _names.json_schema]},
+)
+def names(value: object) -> tuple[str, ...]:
+    """Convert a name or a list of names to a tuple."""
+    if not isinstance(value, (str, list)):
+        raise names.mismatch(value)
+    return _names(value if isinstance(value, list) else [value])
+
+
+def two_names(what: str) -> ValueType[tuple[str, ...]]:
+    """Return the type of a list of two names.
+
+    what: what they name, with an example, such as 'bodies, such as ["world", "cart"]'.
+    """
+    return array("two names", f"the names of two {what}", text, 2, 2)
 
 
 @value_type("true or false", "true or false", {"type": "boolean"})
@@ -245,16 +239,18 @@ def flag(value: object) -> bool:
     raise flag.mismatch(value)
 
 
-def choice(what: str, words: Sequence[str]) -> ValueType[str]:
-    """Return the type of one of some words. what: what the word names, for the message."""
+def choice(what: str, values: Sequence[T]) -> ValueType[T]:
+    """Return the type of one of some texts, true and false; what: what the values choose."""
 
-    def convert(value: object) -> str:
-        if value in words:
-            return str(value)
-        raise ValueError(f"unknown {what} {short_toml(value)}: known are {', '.join(words)}")
+    def convert(value: object) -> T:
+        for each in values:
+            if value == each and type(value) is type(each):
+                return each
+        known = ", ".join(str(x).lower() if isinstance(x, bool) else str(x) for x in values)
+        raise ValueError(f"unknown {what} {short_toml(value)}: known are {known}")
 
-    name = ", ".join(f'"{word}"' for word in words)
-    return ValueType(name, f"one of {name}", {"enum": [*words]}, convert)
+    name = ", ".join(str(x).lower() if isinstance(x, bool) else f'"{x}"' for x in values)
+    return ValueType(name, f"one of {name}", {"enum": [*values]}, convert)
 
 
 @value_type("1", "the version of the format, 1", {"const": 1})
@@ -269,30 +265,13 @@ def version(value: object) -> int:
 # --- [run] ---------------------------------------------------------------------------------------
 
 
-@value_type(
-    'true, false, "parameters", "products"',
-    'true, false, "parameters" or "products"',
-    {"enum": [True, False, "parameters", "products"]},
-)
-def linearization(value: object) -> bool | str:
-    """Check the value of `linearize` in [run]."""
-    if isinstance(value, bool) or value in ("parameters", "products"):
-        return value
-    raise linearization.mismatch(value)
+_frames = array("names", 'true, or a list of bodies and points such as ["tip"]', text)
 
 
-@value_type(
-    "true, false, names",
-    'true, or a list of bodies and points such as ["tip"]',
-    {"anyOf": [{"type": "boolean"}, _array(_TEXT)]},
-)
+@value_type("true, false, names", _frames.words, {"anyOf": [flag.json_schema, _frames.json_schema]})
 def frame_selection(value: object) -> bool | tuple[str, ...]:
     """Convert the value of `frames` in [run]: a bool for all or none, else a tuple of names."""
-    if isinstance(value, bool):
-        return value
-    if isinstance(value, list) and all(isinstance(name, str) for name in value):
-        return tuple(dict.fromkeys(value))
-    raise frame_selection.mismatch(value)
+    return value if isinstance(value, bool) else tuple(dict.fromkeys(_frames(value)))
 
 
 @value_type("number > 0", "greater than zero", {"type": "number", "exclusiveMinimum": 0})
@@ -319,30 +298,29 @@ def tolerance(value: object) -> float:
 
 
 METHOD = choice("method", (*METHODS, "auto"))
+_methods = array("methods", "a list of methods", METHOD, 1)
 
 
 @value_type(
     "method, or a list",
     f"a method, or a list of methods: {METHOD.name}",
-    {"anyOf": [METHOD.json_schema, _array(METHOD.json_schema, 1)]},
+    {"anyOf": [METHOD.json_schema, _methods.json_schema]},
 )
 def methods(value: object) -> tuple[str, ...]:
     """Convert the name of a stepper or a list of names to a tuple; the first is the default."""
-    each = value if isinstance(value, list) and value else [value]
-    return tuple(dict.fromkeys(map(METHOD, each)))
+    return tuple(dict.fromkeys(_methods(value if isinstance(value, list) and value else [value])))
 
 
 # --- [picture] ------------------------------------------------------------------------------------
 
 Place = str | tuple[Value, ...]  # a name, or a vector
 Solid = tuple[Place, tuple[Value, ...], object]  # place, size, rotation
-_PLACE = {"anyOf": [_TEXT, _VECTOR]}
 
 
 @value_type(
     "vectors by name",
     'a table, such as { tip = ["x", "l*cos(theta)"] }',
-    {"type": "object", "additionalProperties": _VECTOR},
+    {"type": "object", "additionalProperties": vector.json_schema},
 )
 def named_points(value: object) -> dict[str, tuple[Value, ...]]:
     """Convert a table of points; returns their vectors by name."""
@@ -351,45 +329,17 @@ def named_points(value: object) -> dict[str, tuple[Value, ...]]:
     return {name: vector(entries) for name, entries in value.items()}
 
 
-def _place(value: object) -> Place:
+@value_type("point", "a point", {"anyOf": [text.json_schema, vector.json_schema]})
+def place(value: object) -> Place:
+    """Convert a point, a name or a vector."""
     return value if isinstance(value, str) else vector(value)
 
 
-@value_type("points", 'a list of points, such as ["tip"]', _array(_PLACE))
-def places(value: object) -> tuple[Place, ...]:
-    """Convert a list of points, each a name or a vector, to a tuple."""
-    if not isinstance(value, list):
-        raise places.mismatch(value)
-    return tuple(map(_place, value))
-
-
-@value_type(
-    "lists of points",
-    'a list of lines, such as [["cart", "tip"]]',
-    _array(_array(_PLACE, 2)),
-)
-def lines(value: object) -> tuple[tuple[Place, ...], ...]:
-    """Convert a list of lines, each through two points or more (names or vectors)."""
-    if not isinstance(value, list):
-        raise lines.mismatch(value)
-    for line in value:
-        if not (isinstance(line, list) and len(line) >= 2):
-            what = f"{lines.words}, each through two points or more: {short_toml(line)}"
-            raise ValueError(f"must be {what}")
-    return tuple(map(places, value))
-
-
-@value_type(
-    "pairs of points",
-    'a list of pairs of points, such as [["cart", "tip"]]',
-    _array(_array(_PLACE, 2, 2)),
-)
-def ends(value: object) -> tuple[tuple[Place, ...], ...]:
-    """Convert a list of pairs of points, such as the ends of springs."""
-    for pair in (pairs := lines(value)):
-        if len(pair) != 2:
-            raise ValueError(f"each goes from a point to another, here there are {len(pair)}")
-    return pairs
+_LINES = 'a list of lines, such as [["cart", "tip"]], each through two points or more'
+_SPRINGS = 'a list of springs, such as [["cart", "tip"]], each from a point to another'
+places = array("points", 'a list of points, such as ["tip"]', place)
+lines = array("lists of points", _LINES, array("points", _LINES, place, 2))
+ends = array("pairs of points", _SPRINGS, array("points", _SPRINGS, place, 2, 2))
 
 
 def solids(size: str, example: str) -> ValueType[tuple[Solid, ...]]:
@@ -405,7 +355,7 @@ def solids(size: str, example: str) -> ValueType[tuple[Solid, ...]]:
     solid = {
         "type": "object",
         "properties": {
-            "at": _PLACE,
+            "at": place.json_schema,
             size: size_type.json_schema,
             "rotation": rotation.json_schema,
         },
@@ -422,31 +372,9 @@ def solids(size: str, example: str) -> ValueType[tuple[Solid, ...]]:
                 raise expected(words, table)
             large = vector(table[size]) if size == "size" else (entry(table[size]),)
             turned = rotation(table["rotation"]) if "rotation" in table else None
-            out.append((_place(table["at"]), large, turned))
+            out.append((place(table["at"]), large, turned))
         return tuple(out)
 
-    return ValueType("tables", words, {"anyOf": [solid, _array(solid)]}, convert)
-
-
-@value_type(
-    '"xy", "xz", "yz"',
-    '"xy", "xz" or "yz", what is drawn to the right and upwards',
-    {"enum": ["xy", "xz", "yz"]},
-)
-def plane_axes(value: object) -> str:
-    """Check that a value is the axes of a plane picture: to the right and upwards."""
-    if value in plane_axes.json_schema["enum"]:
-        return str(value)
-    raise plane_axes.mismatch(value)
-
-
-@value_type(
-    '"world", "body"',
-    '"world" or "body", whose axes the entries are along',
-    {"enum": ["world", "body"]},
-)
-def frame(value: object) -> str:
-    """Check that a value is the frame along whose axes vectors are given."""
-    if value in ("world", "body"):
-        return str(value)
-    raise frame.mismatch(value)
+    return ValueType(
+        "tables", words, {"anyOf": [solid, {"type": "array", "items": solid}]}, convert
+    )
