@@ -22,7 +22,7 @@ from eomc.cli.options import escape_line, say, status_line, warn
     "--c",
     "folder",
     metavar="DIR",
-    type=click.Path(path_type=Path),
+    type=options.PATH,
     help="Write only the C into DIR, without a compiler and without a Python module.",
 )
 @click.option(
@@ -146,7 +146,7 @@ def export_command() -> None:
     "--fmi", type=click.Choice(["2", "3"]), default="2", show_default=True,
     help="FMI version: 2.0, which most tools read, or 3.0.",
 )  # fmt: skip
-@click.option("--out", type=click.Path(path_type=Path), help="The FMU; by default NAME.fmu.")
+@click.option("--out", type=options.PATH, help="The FMU; by default NAME.fmu.")
 @click.option("--sources", is_flag=True, help="Sources only, without a binary.")
 @options.QUIET
 def export_fmu(scene: Path, fmi: str, out: Path | None, sources: bool, quiet: bool) -> None:
@@ -177,7 +177,7 @@ def _export_package(library: str, title: str, description: str) -> None:
     @options.SCENE
     @click.option(
         "--out",
-        type=click.Path(path_type=Path),
+        type=options.PATH,
         help=f"Folder of the package, by default NAME_{library}.",
     )
     @click.option("--step-size", "h", type=float, help="Step size, s, by default the scene's h.")

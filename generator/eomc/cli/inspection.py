@@ -192,7 +192,7 @@ def check_command(
     type=click.IntRange(1, 17),
     help="Recommend a method and h for this number of digits only.",
 )
-@click.option("--json", "file", type=click.Path(path_type=Path), help="Write all results to FILE.")
+@click.option("--json", "file", type=options.PATH, help="Write all results to FILE.")
 @options.QUIET
 def report_command(
     scenes: Sequence[Path], root: Path, digits: int | None, file: Path | None, quiet: bool

@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
@@ -131,35 +132,37 @@ def status_line(what: str, silent: bool) -> Iterator[None]:
         yield
 
 
-Arguments = TypeVar("Arguments")
-
-SCENE = click.argument("scene", type=click.Path(path_type=Path))
-SCENES = click.argument("scenes", nargs=-1, required=True, type=click.Path(path_type=Path))
+PATH = click.Path(path_type=Path)
+SCENE = click.argument("scene", type=PATH)
+SCENES = click.argument("scenes", nargs=-1, required=True, type=PATH)
 BUILD = click.option(
-    "--build", "root", default="build", show_default=True, type=click.Path(path_type=Path),
+    "--build", "root", default="build", show_default=True, type=PATH,
     help="Folder of built modules.",
+)  # fmt: skip
+SET = click.option(
+    "--set", "parameters", multiple=True, metavar="NAME=VALUE", help="Value of a parameter."
+)
+START = click.option(
+    "--start", multiple=True, metavar="NAME=VALUE",
+    help="Initial value of a coordinate, or of its velocity NAME_dot.",
 )  # fmt: skip
 QUIET = click.option("--quiet", "-q", is_flag=True, help="Print errors only.")
 JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 
 
-def parse_into(
-    arguments: Callable[..., Arguments],
-) -> Callable[[Callable[[Arguments], None]], Callable[..., None]]:
-    """Return a decorator for a command that takes all of its parsed arguments as one object.
+def as_namespace(function: Callable[[SimpleNamespace], None]) -> Callable[..., None]:
+    """Make a command of a function that takes all parsed arguments as attributes of one object.
 
-    arguments: class of the object. It is called with the parsed arguments as keywords, by the names
-    that the decorators of click give them.
+    They have the names that the decorators of click give them. The attribute `silent` is true if no
+    progress is shown.
     """
 
-    def decorate(function: Callable[[Arguments], None]) -> Callable[..., None]:
-        @wraps(function)
-        def command(**parsed: Any) -> None:
-            function(arguments(**parsed))
+    @wraps(function)
+    def command(**parsed: Any) -> None:
+        silent = parsed.get("quiet") or parsed.get("as_json")
+        function(SimpleNamespace(**parsed, silent=silent))
 
-        return command
-
-    return decorate
+    return command
 
 
 def parse_pairs(

@@ -54,34 +54,6 @@ class _RunCommand(click.Command):
 
 
 @dataclass(frozen=True)
-class RunArguments:
-    """Arguments of `eomc run`; the help texts of its options describe them."""
-
-    scene: Path
-    root: Path
-    parameters: Sequence[str]
-    start: Sequence[str]
-    inputs: Sequence[str]
-    h: float | None
-    duration: float | None
-    method: str | None
-    tol: float | None
-    event: Sequence[str]
-    every: int
-    out: Path | None
-    plot: Path | None
-    wrap: bool
-    animate: Path | None
-    quiet: bool
-    as_json: bool
-
-    @property
-    def silent(self) -> bool:
-        """True if no progress is shown."""
-        return self.quiet or self.as_json
-
-
-@dataclass(frozen=True)
 class Simulation:
     """A run, the computing time in s, and remarks on its step size and its duration.
 
@@ -103,15 +75,8 @@ class Simulation:
 @click.command("run", cls=_RunCommand)
 @options.SCENE
 @options.BUILD
-@click.option(
-    "--set", "parameters", multiple=True, metavar="NAME=VALUE", help="Value of a parameter."
-)
-@click.option(
-    "--start",
-    multiple=True,
-    metavar="NAME=VALUE",
-    help="Initial value of a coordinate, or of its velocity NAME_dot.",
-)
+@options.SET
+@options.START
 @click.option(
     "--input", "inputs", multiple=True, metavar="NAME=VALUE",
     help="Constant value of an input; the others have the scene's signals.",
@@ -124,20 +89,18 @@ class Simulation:
     "--event", multiple=True, metavar="NAME=FORMULA", help="Print when a formula crosses zero."
 )
 @click.option("--every", type=click.IntRange(1), default=1, help="Store every N-th step.")
-@click.option(
-    "--out", type=click.Path(path_type=Path), help="Write the rows: FILE.csv or FILE.npz."
-)
-@click.option("--plot", type=click.Path(path_type=Path), help="Plot them: FILE.png, .svg or .pdf.")
+@click.option("--out", type=options.PATH, help="Write the rows: FILE.csv or FILE.npz.")
+@click.option("--plot", type=options.PATH, help="Plot them: FILE.png, .svg or .pdf.")
 @click.option("--wrap", is_flag=True, help="Draw angles from -pi to pi in --plot.")
 @click.option(
     "--animate",
-    type=click.Path(path_type=Path),
+    type=options.PATH,
     help="Animate them: FILE.html, a page; FILE.gif or .mp4, a film.",
 )
 @options.QUIET
 @options.JSON
-@options.parse_into(RunArguments)
-def run_command(arguments: RunArguments) -> None:
+@options.as_namespace
+def run_command(arguments: SimpleNamespace) -> None:
     """Simulate a scene; print the final state, its error and the speed.
 
     \b
@@ -192,7 +155,7 @@ def run_command(arguments: RunArguments) -> None:
         sys.exit(130 if interrupted else 1)
 
 
-def _simulate(module: Any, arguments: RunArguments, start: Mapping[str, Any]) -> Simulation:
+def _simulate(module: Any, arguments: SimpleNamespace, start: Mapping[str, Any]) -> Simulation:
     """Simulate, and note whether the step size and the duration are suitable.
 
     start: arguments of `simulate` for the parameters, the initial state and the inputs.
@@ -476,7 +439,7 @@ MAX_BYTES = 10 * 10**9  # of a store that is created without --yes
 
 
 @click.command("sweep")
-@click.argument("file", type=click.Path(path_type=Path))
+@click.argument("file", type=options.PATH)
 @click.option("--over", multiple=True, metavar="NAME=A:B:N", help="A grid axis; or NAME=A,B,C.")
 @click.option(
     "--draw", "draws", multiple=True, metavar="NAME=KIND:A,B",
@@ -487,7 +450,7 @@ MAX_BYTES = 10 * 10**9  # of a store that is created without --yes
 @click.option("--seed", type=click.IntRange(0), help="Seed of the draws.")
 @click.option("--keep", metavar="A,B", help="Stored columns, such as theta,x.max.")
 @click.option("--duration", type=float, help="Simulated time, s.")
-@click.option("--out", type=click.Path(path_type=Path), help="Folder of the store.")
+@click.option("--out", type=options.PATH, help="Folder of the store.")
 @click.option("--workers", type=click.IntRange(1), help="Number of processes.")
 @click.option(
     "--scheduler", metavar="ADDRESS", help="Address of Dask's scheduler, such as tcp://host:8786."
@@ -497,12 +460,12 @@ MAX_BYTES = 10 * 10**9  # of a store that is created without --yes
 @click.option(
     "--status", is_flag=True, help="Print the number of finished blocks, without computing."
 )
-@click.option("--plot", type=click.Path(path_type=Path), help="Plot the first quantity into FILE.")
-@click.option("--parquet", type=click.Path(path_type=Path), help="Write Parquet files into DIR.")
+@click.option("--plot", type=options.PATH, help="Plot the first quantity into FILE.")
+@click.option("--parquet", type=options.PATH, help="Write Parquet files into DIR.")
 @click.option("--yes", is_flag=True, help="Allow a store of more than 10 GB.")
 @options.QUIET
 @options.JSON
-@options.parse_into(SimpleNamespace)
+@options.as_namespace
 def sweep_command(command: SimpleNamespace) -> None:
     """Simulate a scene for many values of its quantities; store the results on disk.
 
@@ -580,9 +543,8 @@ def _run_sweep(command: SimpleNamespace, arguments: SweepArguments) -> None:
         _print_sweep_status(command, prepare_sweep(arguments, command.out))
         return
     client = command.scheduler if command.workers is None else command.workers
-    silent = command.quiet or command.as_json
-    with progress_bar("sweep", silent) as update:
-        progress = None if silent else _log_progress(update)
+    with progress_bar("sweep", command.silent) as update:
+        progress = None if command.silent else _log_progress(update)
         execution = Execution(client, command.threads, None, command.part, progress)
         max_bytes = math.inf if command.yes else MAX_BYTES
         path, state = run_sweep(arguments, command.out, execution, max_bytes)
@@ -642,31 +604,23 @@ def _print_sweep_end(command: SimpleNamespace, path: Path, state: SweepProgress)
 
 @click.command("fit")
 @options.SCENE
-@click.argument("log", type=click.Path(path_type=Path))
+@click.argument("log", type=options.PATH)
 @options.BUILD
 @click.option(
     "--free", metavar="NAME,...",
     help="Values to estimate: parameters, and coordinates or velocities NAME_dot, whose initial "
     "values are estimated. By default all parameters.",
 )  # fmt: skip
-@click.option(
-    "--set", "parameters", multiple=True, metavar="NAME=VALUE",
-    help="Value of a parameter: the initial guess of a free one.",
-)  # fmt: skip
-@click.option(
-    "--start", multiple=True, metavar="NAME=VALUE",
-    help="Initial value of a coordinate, or of its velocity NAME_dot.",
-)  # fmt: skip
+@options.SET
+@options.START
 @click.option(
     "--bounds", multiple=True, metavar="NAME=LOW:HIGH", help="Bounds of a free value; one may lack."
 )
 @click.option("--h", "h", type=float, help="Largest step size in s, instead of the scene's.")
-@click.option(
-    "--plot", type=click.Path(path_type=Path), help="Plot the fit: FILE.png, .svg or .pdf."
-)
+@click.option("--plot", type=options.PATH, help="Plot the fit: FILE.png, .svg or .pdf.")
 @options.QUIET
 @options.JSON
-@options.parse_into(SimpleNamespace)
+@options.as_namespace
 def fit_command(arguments: SimpleNamespace) -> None:
     """Estimate parameters from measured columns; LOG is a CSV file.
 
@@ -683,7 +637,7 @@ def fit_command(arguments: SimpleNamespace) -> None:
     system = pipeline.read(arguments.scene)
     known = {p.name: p.value for p in system.parameters}
     free = None if arguments.free is None else [n.strip() for n in arguments.free.split(",")]
-    with status_line(f"fitting {arguments.scene.stem}", arguments.quiet or arguments.as_json):
+    with status_line(f"fitting {arguments.scene.stem}", arguments.silent):
         result = fit(
             system, arguments.log, free=free,
             values={

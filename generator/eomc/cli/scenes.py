@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -80,30 +81,11 @@ def _copy_shipped(source: str, name: str) -> str:
 # --- import ---------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class ImportArguments:
-    """Arguments of `eomc import`; the help texts of its options describe them."""
-
-    file: Path
-    out: Path | None
-    name: str | None
-    locks: Sequence[str]
-    root: str
-    tip: str
-    base: str | None
-    no_drives: bool
-    mend_inertias: bool
-    stops: bool
-    limits: bool
-    parameters: str | None
-    include: bool
-
-
 @click.command("import")
-@click.argument("file", type=click.Path(path_type=Path))
+@click.argument("file", type=options.PATH)
 @click.option(
     "--out",
-    type=click.Path(path_type=Path),
+    type=options.PATH,
     help="The scene; by default scenes/NAME.toml, or NAME.toml if there is no scenes/.",
 )
 @click.option("--name", help="Name of the scene, instead of the robot's.")
@@ -141,8 +123,8 @@ class ImportArguments:
 @click.option(
     "--include", is_flag=True, help="Open the files that <include> names, in the file's folder."
 )
-@options.parse_into(ImportArguments)
-def import_command(arguments: ImportArguments) -> None:
+@options.as_namespace
+def import_command(arguments: SimpleNamespace) -> None:
     """Write the scene of a robot file, URDF or MJCF, and report what is left out.
 
     \b
@@ -176,7 +158,7 @@ def import_command(arguments: ImportArguments) -> None:
     say(f"try: eomc dof {typed}; eomc run {typed}")
 
 
-def _read_robot(arguments: ImportArguments) -> Robot:
+def _read_robot(arguments: SimpleNamespace) -> Robot:
     """Read the robot file, and give the robot the requested name."""
     from eomc.base import names
     from eomc.robots import mjcf, urdf, xml
@@ -195,7 +177,7 @@ def _read_robot(arguments: ImportArguments) -> Robot:
     return replace(robot, name=name)
 
 
-def _edit_robot(robot: Robot, arguments: ImportArguments) -> Robot:
+def _edit_robot(robot: Robot, arguments: SimpleNamespace) -> Robot:
     """Return the robot, prepared for a scene, with the changes that the options request."""
     from eomc.robots import edit, scene_text
     from eomc.robots.robot import with_left_out_note
@@ -225,7 +207,7 @@ def _edit_robot(robot: Robot, arguments: ImportArguments) -> Robot:
 
 
 @click.command("schema")
-@click.option("--out", type=click.Path(path_type=Path), help="Write the schema to this file.")
+@click.option("--out", type=options.PATH, help="Write the schema to this file.")
 def schema_command(out: Path | None) -> None:
     """Print the JSON Schema of scenes, for completion and checks in editors.
 
@@ -249,7 +231,7 @@ Row = dict[str, Any]
 
 
 @click.command("list")
-@click.argument("folders", nargs=-1, type=click.Path(path_type=Path))
+@click.argument("folders", nargs=-1, type=options.PATH)
 @options.BUILD
 @options.JSON
 def list_command(folders: Sequence[Path], root: Path, as_json: bool) -> None:
