@@ -106,14 +106,14 @@ def test_phase_portraits_follow_the_curves(run) -> None:
 
 def test_axes_can_be_passed_and_are_returned(run, pyplot: Any) -> None:
     _, own_axes = pyplot.subplots(2)
-    assert all(a is b for a, b in zip(run.plot("x", "theta", axes=own_axes), own_axes, strict=True))
+    assert all(a is b for a, b in zip(run.plot("x", "theta", ax=own_axes), own_axes, strict=True))
     assert run.plot("x", "theta", ax=own_axes[0], color="red", linewidth=3) is own_axes[0]
     assert [a.get_color() for a in own_axes[0].get_lines()[1:]] == ["red", "red"]
     initial_count = len(pyplot.get_fignums())
-    with pytest.raises(ValueError, match="axes: 2 for 4 panels"):
-        run.plot(axes=own_axes)
-    with pytest.raises(ValueError, match="give one of them"):
-        run.plot("x", ax=own_axes[0], axes=own_axes)
+    with pytest.raises(ValueError, match="ax: 2 for 4 panels"):
+        run.plot(ax=own_axes)
+    with pytest.raises(ValueError, match="axes: give ax="):
+        run.plot("x", axes=own_axes)
     assert len(pyplot.get_fignums()) == initial_count
 
 

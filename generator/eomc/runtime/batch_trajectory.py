@@ -229,7 +229,7 @@ class BatchTrajectory(Columns):
     def plot(
         self, *names: str, quantiles: Sequence[float] = (0.05, 0.25, 0.5, 0.75, 0.95),
         lines: int | None = None, over: Any = None, wrap: bool | str | Sequence[str] = False,
-        ax: Any = None, axes: Any = None, file: File | None = None, **style: Any,
+        ax: Any = None, file: File | None = None, **style: Any,
     ) -> Any:  # fmt: skip
         """Plot the distribution of the instances over time, as bands between quantiles.
 
@@ -245,7 +245,7 @@ class BatchTrajectory(Columns):
         over : str or (batch,) array, optional
             Draw the final value of each instance instead, over "instance" (its index), a parameter
             or these numbers.
-        wrap, ax, axes, file, **style
+        wrap, ax, file, **style
             As in `Trajectory.plot`.
 
         Returns
@@ -267,7 +267,7 @@ class BatchTrajectory(Columns):
             raise TypeError(f"plot: {name}= {single_run_hint(self)}.plot({name}=...)")
         from .plot import Figure, draw_fan
 
-        figure = Figure(wrap, ax, axes, file, style)
+        figure = Figure(wrap, ax, file, style)
         return draw_fan(self, names, figure, quantiles, lines, over)
 
     def animate(

@@ -177,25 +177,22 @@ class Figure(NamedTuple):
 
     wrap: bool | str | Collection[str] = False
     ax: Any = None
-    axes: Any = None
     file: File | None = None
     style: Mapping[str, Any] = {}
 
     def panels(self, count: int, portraits: int = 0) -> list[Any]:
         """Return the Axes of `count` panels and of phase portraits: the user's, or new ones.
 
-        Raises ValueError if `ax` and `axes` are both given, or their number does not fit.
+        Raises ValueError if the number of the user's Axes does not fit.
         """
-        if self.ax is None and self.axes is None:
+        if "axes" in self.style:
+            raise ValueError("axes: give ax=, one Axes, or a list with one for each panel")
+        if self.ax is None:
             return new_axes(count, portraits)
-        if self.ax is not None and self.axes is not None:
-            raise ValueError("ax, axes: give one of them")
-        name, all_axes = "axes", [*np.ravel(self.axes)]
-        if self.ax is not None:
-            name, all_axes = "ax", [self.ax]
+        all_axes = [*np.ravel(self.ax)]
         if len(all_axes) != count + portraits:
             raise ValueError(
-                f"{name}: {len(all_axes)} for {count + portraits} panels: give axes=, one a panel"
+                f"ax: {len(all_axes)} for {count + portraits} panels: give a list, one a panel"
             )
         return all_axes
 
@@ -222,7 +219,7 @@ def plot(
     pairs = _pairs(phase, sources[0])
     columns = [*names] or ([] if pairs else sources[0].default())
     panels = grouped([sources[0].curve(name) for name in columns])
-    if figure.ax is not None and panels:
+    if panels and figure.ax is not None and not np.ndim(figure.ax):  # one for all
         panels = [[c for panel in panels for c in panel]]
     all_axes = figure.panels(len(panels), len(pairs))
     for place, panel in zip(all_axes, panels, strict=False):
@@ -450,7 +447,7 @@ def _picture(run: Any) -> str:
         grid = figure.add_gridspec(len(panels), 2 if drawn else 1)
         axes = [figure.add_subplot(grid[0, 0])]
         axes += [figure.add_subplot(grid[k, 0], sharex=axes[0]) for k in range(1, len(panels))]
-        plot(run, shown, Figure(axes=axes))
+        plot(run, shown, Figure(ax=axes))
         for above in axes[:-1]:
             above.tick_params(labelbottom=False)
         if drawn:

@@ -411,8 +411,8 @@ class Trajectory(Columns):
     def plot(
         self, *names: str, phase: Any = None, section: Mapping[str, Array] | None = None,
         other: Trajectory | Sequence[Trajectory] = (), labels: Sequence[str] | None = None,
-        wrap: bool | str | Sequence[str] = False, ax: Any = None, axes: Any = None,
-        file: File | None = None, **style: Any,
+        wrap: bool | str | Sequence[str] = False, ax: Any = None, file: File | None = None,
+        **style: Any,
     ) -> Any:  # fmt: skip
         """Plot columns of the run over time, or phase portraits, with matplotlib.
 
@@ -432,10 +432,8 @@ class Trajectory(Columns):
         wrap : bool, str or sequence of str
             Angles that are drawn from -pi to pi, without lines where they jump: the named ones, or
             with True all coordinates in rad.
-        ax : Axes, optional
-            One Axes for all columns.
-        axes : sequence of Axes, optional
-            One Axes for each panel.
+        ax : Axes or sequence of Axes, optional
+            One Axes for all columns, or one for each panel.
         file : str or path, optional
             File to which the figure is written as well.
         **style
@@ -452,11 +450,11 @@ class Trajectory(Columns):
         KeyError
             If a name is unknown.
         ValueError
-            If the number of `axes` or `labels` does not fit.
+            If the number of Axes or `labels` does not fit.
         """
         from .plot import Figure, plot
 
-        return plot(self, names, Figure(wrap, ax, axes, file, style), phase, other, section, labels)
+        return plot(self, names, Figure(wrap, ax, file, style), phase, other, section, labels)
 
     def section(
         self, name: str, value: float = 0.0, *, rising: bool | None = None,
