@@ -2,7 +2,7 @@
 
 - The pages of a section are those that its page lists, `- [title](page.md): ...`. The lists are
   read on code-hosting sites too, which show no `toctree`.
-- Links to files of the repository that are no pages of the site become their paths.
+- Links to examples download them. Links to other files of the repository become their paths.
 - Directives write what is generated: `scene-keys`, `gallery` and `c-functions`.
 - Formulas are MathML, which needs no script.
 - The search ranks sections (static/search.js), also by the terms of the glossary that lead to them.
@@ -24,6 +24,7 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
 ROOT = Path(__file__).parents[2]
+EXAMPLES = ROOT / "docs" / "examples"
 SECTIONS = ("README", "tutorials", "how-to", "reference", "explanation")
 # generated pages and those for developers are less often what a user looks for
 SEARCH_WEIGHTS = {"reference/": 0.7, "explanation": 0.6, "glossary": 0.8}
@@ -50,10 +51,23 @@ def _link(app: Sphinx, page: str, match: re.Match[str]) -> str:
     inside = path.is_relative_to(app.srcdir) and app.project.path2doc(str(path)) is not None
     if image or (inside and path.suffix in (".md", ".ipynb")):
         return match[0]
+    if path.is_relative_to(EXAMPLES):
+        return _downloads(app, words.replace("`", ""), path)
     shown = path.relative_to(ROOT).as_posix() + ("/" if path.is_dir() else "")
     if words.strip("`").rstrip("/").endswith(Path(shown).name):
         return f"`{shown}`"
     return f"{words} (`{shown}`)"
+
+
+def _downloads(app: Sphinx, words: str, path: Path) -> str:
+    """Return a link that downloads an example, or the words and such links to a folder's files."""
+    files = [path] if path.is_file() else sorted(each for each in path.iterdir() if each.is_file())
+    links = [
+        f"{{download}}`{words if path.is_file() else file.name} "
+        f"</{file.relative_to(app.srcdir).as_posix()}>`"
+        for file in files
+    ]
+    return links[0] if path.is_file() else f"{words} ({', '.join(links)})"
 
 
 class Generated(SphinxDirective):

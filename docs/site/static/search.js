@@ -24,7 +24,7 @@ const siteSearch = (() => {
 
   const split = (text) =>
     (text.toLowerCase().match(/[\p{L}\p{N}_]+/gu) || [])
-      .filter((word) => !stopwords.has(word))
+      .filter((word) => !stopwords.has(word) && (word.length > 1 || word === "c"))
       .map(stem);
 
   const count = (words) => {
