@@ -200,7 +200,7 @@ push = { unit = "N m", signal = "sin(t)" }
 lean = "sin(theta + x)"
 [energy]
 kinetic = "x_dot**2 + x_dot*theta_dot*cos(theta) + theta_dot**2"
-potential = "9.81*cos(theta)"
+potential = "(9 + sin(t))*cos(theta)"
 [forces]
 x = "force"
 theta = "push*cos(x)"
@@ -219,15 +219,37 @@ def test_batch_of_states_agrees_with_single_states(
 ) -> None:
     m = modules.unoptimised(LOOP)
     q, qd = STATES
-    many = m.linearize(q, qd, t=t, params={"k": 2.0}, **how)
+    values = np.linspace(1, 2, 6)
+    many = m.linearize(q, qd, t=t, params={"k": values}, **how)
     assert [x.shape for x in many[:2]] == [(6, 4, 4), (6, 4, 2)]
     for k in range(6):
         now = np.broadcast_to(t, 6)[k]
-        one = m.linearize(q[k], qd[k], t=float(now), params={"k": 2.0}, **how)
+        one = m.linearize(q[k], qd[k], t=float(now), params={"k": values[k]}, **how)
         assert all(np.array_equal(a[k], b) for a, b in zip(many, one, strict=True))
     assert [len(x) for x in m.linearize(q[:0], qd[:0])] == [0, 0]
     with pytest.raises(ValueError, match=r"t: shape \(3,\), expected one number or \(6,\)"):
         m.linearize(q, qd, t=np.zeros(3))
+
+
+def test_angle_beyond_those_of_registers_is_linearized_by_scalar_code(modules: Modules) -> None:
+    """Sines in vector registers are wrong beyond 2^20 rad."""
+    m = modules.unoptimised(LOOP)
+    q, qd = STATES.copy()
+    q[3, 1] = 3e6
+    singles = [m.linearize(*state) for state in zip(q, qd, strict=True)]
+    for a, b in zip(m.linearize(q, qd), zip(*singles, strict=True), strict=True):
+        assert np.array_equal(a, b)
+    qd[4, 1] = 1e200
+    with pytest.raises(m.MotionError, match=r"a derivative is not finite there"):
+        m.linearize(q, qd)
+
+
+def test_states_left_over_do_not_write_beyond_their_results(modules: Modules) -> None:
+    m, (q, qd) = modules.unoptimised(LOOP), STATES
+    A, B = np.full((6, 4, 4), np.nan), np.full((6, 4, 2), np.nan)
+    m.linearize(q[:3], qd[:3], out=(A[:3], B[:3]))
+    for result in (A, B):
+        assert np.isfinite(result[:3]).all() and np.isnan(result[3:]).all()
 
 
 def test_state_without_linearization_is_named(modules: Modules) -> None:

@@ -412,6 +412,7 @@ def _fails(printer: Printer, pair: tuple[Operand, Operand], tolerance: float) ->
     limit = _decimal(float(f"{tolerance:.1e}")) + printer.real.suffix
     text = printer.operand(pivot, 2)
     if lane := printer.real.lane:
+        text = printer.vector_operand(pivot)
         less = "" if pivot == diagonal else f" - {limit}*{printer.operand(diagonal, 4)}"
         return f"{printer.prefix}_not_positive_{lane}({text}{less})"
     if pivot == diagonal:

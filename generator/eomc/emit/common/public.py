@@ -331,6 +331,29 @@ class Public:
         return self._status("linearization", *out, *self.arguments(*STATE, "t", "u", "p"))
 
     @property
+    def linearization_block(self) -> CFunction | None:
+        """The prototype of the C function that linearizes several states in vector registers.
+
+        Only optimised C has it, if the scene requests derivatives and they are not computed by
+        columns. It computes A and B of dx/dt = A x + B u, x = [q; qd], and returns a count of
+        states.
+        """
+        target, s = self.target, self.target.system
+        if "linearization" not in target.program or not s.run.needs_derivatives:
+            return None
+        real, count = target.real.name, CArgument("long", "count")
+        out = (output_array(real, name) for name in ("A", *(["B"] if s.inputs else [])))
+        needed = {"t": target.driven, "u": bool(s.inputs), "p": target.needs_p}
+        own = [
+            argument
+            for name in (name for name, is_needed in needed.items() if is_needed)
+            for argument in (input_array(real, name), CArgument("long", f"{name}_instance"))
+        ]
+        state = (input_array(real, name) for name in STATE)
+        name = f"{target.prefix}_linearization_block"
+        return CFunction(name, "long", (count, *out, *state, *own))
+
+    @property
     def project(self) -> CFunction:
         """The prototype of the C function that projects a state (q, qd) onto the constraints.
 

@@ -128,7 +128,12 @@ class Steppers:
 
     @property
     def uses_registers(self) -> bool:
-        """Whether the code computes several instances, or stages, at once in vector registers."""
+        """Whether the code computes several instances or stages in vector registers."""
+        return self.steps_in_registers or self.functions.public.linearization_block is not None
+
+    @property
+    def steps_in_registers(self) -> bool:
+        """Whether steps compute several instances, or stages, at once in vector registers."""
         return self.functions.target.system.run.batch or self.functions.iterates_stages
 
     @property
@@ -471,7 +476,10 @@ def _lanes(steppers: Steppers) -> Iterator[str]:
     yield show("c/optimised/lane.c", functions, steppers=steppers, lane=one)
     if steppers.uses_registers:
         yield _library(functions, wide)
+    if steppers.steps_in_registers:
         yield show("c/optimised/lane.c", functions, steppers=steppers, lane=wide)
+    if functions.public.linearization_block:
+        yield show("c/optimised/linearization_block.c", functions, lane=wide)
     if functions.projection:
         yield "\n\n".join(one.projection_source(functions)) + "\n"
         if batch:

@@ -610,6 +610,36 @@ class Lane:
             self.target.program["signal"], signature, "The scene's signals."
         )
 
+    @property
+    def parameters(self) -> str:
+        """The C definition of the struct with the scene's parameters; "" if none is needed."""
+        names = self.accelerations.parameter_names if self.target.needs_p else ()
+        return c.define_struct(self._parameters, self.real.name, names) if names else ""
+
+    @property
+    def _parameters(self) -> str:
+        """The C type of the struct with the scene's parameters in this lane."""
+        return f"{self.prefix}_params{self.suffix}"
+
+    @cached_property
+    def linearization(self) -> GeneratedFunction:
+        """The C function for the rows of [da/dq, da/dqd], behind them those of da/du."""
+        function, n = self.target.program["linearization"], len(self.target.names)
+        m, width = len(self.target.input_names), 2 * n
+        places = [
+            f"r[{width * i + j if j < width else n * width + m * i + j - width}]"
+            for i in range(n)
+            for j in range(width + m)
+        ]
+        takes = [a for a in self.argument_names if a not in "sc"]
+        parameters = frozenset(self.accelerations.parameter_names)
+        p = c.input_array(self._parameters, "p")
+        extra = [(p, parameters, c.member("p", "{}"))] if self.target.needs_p else ()
+        out = c.output_array(self.real.name, "r")
+        signature = Signature("slopes", out, places, takes, {}, extra)
+        doc = "The rows of [da/dq, da/dqd], then those of da/du, at constant inputs."
+        return self.generate_function(function, signature, doc, inline=False)
+
     @cached_property
     def compute_constants(self) -> GeneratedFunction:
         """The C function that precomputes expressions that depend on the parameters only.
@@ -677,17 +707,17 @@ class Lane:
     def math_functions(self) -> tuple[str, ...]:
         """Sorted names of the mathematical functions in the scene's accelerations and signals.
 
-        The projection onto the constraints is included; sine and cosine are not.
+        The projection onto the constraints and the linearization are included. Sine and cosine are
+        not, except of parameters in the linearization.
         """
-        functions = [self.accelerations.function]
-        others = ("signal", "projection")
-        functions += [f for n in others if (f := self.target.program.functions.get(n))]
-        names = {
-            a.value.function
-            for f in functions
-            for a in (*f.early, *f.body)
-            if isinstance(a.value, Call)
-        } - {"sin", "cos", "reciprocal"}  # fmt: skip
+        others = map(self.target.program.functions.get, ("signal", "projection", "linearization"))
+        functions = [self.accelerations.function, *filter(None, others)]
+        assignments = [a for f in functions for a in (*f.early, *f.body)]
+        names = {a.value.function for a in assignments if isinstance(a.value, Call)}
+        names -= {"sin", "cos", "reciprocal"}
+        if functions[-1].name == "linearization":
+            calls = (a.value for a in functions[-1].early if isinstance(a.value, Call))
+            names |= {call.function for call in calls} & {"sin", "cos"}
         return tuple(sorted({"sign" if n == "heaviside" else n for n in names}))
 
     @property
