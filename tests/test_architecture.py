@@ -24,7 +24,7 @@ LAYERS = (
     ("emit",),
     ("toolchain", "pipeline"),
     ("report", "sweeps"),
-    ("identification",),
+    ("identification", "inertial_parameters"),
     ("cli",),
 )
 ENTRY_POINTS = {"__init__", "__main__"}  # no module of the package imports these
@@ -166,7 +166,7 @@ MAX_LONG_SIGNATURES = 8  # functions with more than seven parameters
 MAX_PRIVATE_ACCESSES = 13  # of attributes of objects other than self
 MAX_NUMERIC_CONSTANTS = 240  # at module level
 MAX_REPEATED_CLASS_NAMES = 1
-MAX_MODULES = 160
+MAX_MODULES = 161
 
 
 def test_functions_are_short() -> None:

@@ -11,7 +11,7 @@ import pytest
 import eomc
 
 PUBLIC = {"System", "build", "dot", "equations", "export", "export_fmu", "load", "read"}
-PUBLIC |= {"fit", "sources", "sweep"}
+PUBLIC |= {"fit", "regressor", "sources", "sweep"}
 
 
 def test_dir_lists_the_public_names_of_the_package() -> None:

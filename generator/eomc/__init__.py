@@ -13,13 +13,14 @@ from eomc.pipeline import build, export, export_fmu, load, read, sources
 
 if TYPE_CHECKING:
     from eomc.identification import fit
+    from eomc.inertial_parameters import regressor
     from eomc.model.system import System, dot
     from eomc.report.equations import equations
     from eomc.sweeps.sweep import sweep
 
 __all__ = [
     "EomcError", "SceneError", "System", "__version__", "build", "dot", "equations", "export",
-    "export_fmu", "fit", "load", "read", "sources", "sweep",
+    "export_fmu", "fit", "load", "read", "regressor", "sources", "sweep",
 ]  # fmt: skip
 
 
@@ -29,7 +30,7 @@ def __dir__() -> list[str]:
 
 
 def __getattr__(name: str) -> object:
-    """Import System, dot, equations, fit or sweep on first use: SymPy alone takes half a second."""
+    """Import System and other names on first use, because SymPy alone takes half a second."""
     if name in ("System", "dot"):
         from eomc.model import system
 
@@ -42,6 +43,10 @@ def __getattr__(name: str) -> object:
         from eomc.identification import fit
 
         return fit
+    if name == "regressor":
+        from eomc.inertial_parameters import regressor
+
+        return regressor
     if name == "sweep":
         from eomc.sweeps.sweep import sweep
 

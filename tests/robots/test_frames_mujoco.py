@@ -21,6 +21,7 @@ from robots.test_robots_mujoco import (
     working_folder,  # noqa: F401 - a fixture, for all tests here
 )
 
+import eomc
 from eomc.derive.frames import momentum, motions, wrenches
 from eomc.derive.lagrange import inverse_dynamics
 from eomc.derive.tape import Tape
@@ -127,3 +128,27 @@ def test_robots_agree_with_mujoco(name: str, free: bool, tmp_path: Path) -> None
         mass = model.body_subtreemass[0]
         linear, angular = mass * data.subtree_linvel[0], data.subtree_angmom[0]
         near(computed, np.hstack([mass, data.subtree_com[0], linear, angular]), "momentum")
+
+
+@pytest.mark.parametrize(
+    ("name", "locked", "count"),
+    [
+        ("ur10_robot", {}, 36),
+        ("panda", {"panda_finger_joint1": 0.0, "panda_finger_joint2": 0.0}, 43),
+    ],
+)
+def test_number_of_base_parameters_of_robots(
+    name: str, locked: dict[str, float], count: int, tmp_path: Path
+) -> None:
+    """7 n - 4 - 2 with a vertical first axis and a second one across it (Mayeda et al., 1990)."""
+    scene = tmp_path / "robot.toml"
+    scene.write_text(from_urdf(f"/{name}.urdf", tmp_path, locked=locked).text(), encoding="utf-8")
+    regressor = eomc.regressor(scene, tmp_path)
+    module, n = regressor.module, len(regressor.module.coordinates)
+    q, qd, qdd = np.random.default_rng(2).uniform(-3, 3, (3, 500, n))
+    Y = regressor.Y(q, qd, qdd)
+    drives = module.inverse_dynamics(q, qd, qdd) - module.tau(q, qd, u=np.zeros((500, n)))
+    assert np.abs(Y @ regressor.parameters - drives).max() < 1e-12 * np.abs(drives).max()
+    columns = regressor.base_parameters().columns
+    assert sum(k < 10 * n for k in columns) == count == 7 * n - 6
+    assert np.linalg.matrix_rank(Y[..., : 10 * n].reshape(-1, 10 * n)) == count
