@@ -61,6 +61,34 @@ def test_reference_has_every_key_of_a_scene(pages: ModuleType) -> None:
     )
 
 
+def test_guide_to_scenes_has_the_keys_and_defaults_of_the_schema(pages: ModuleType) -> None:
+    text = (DOCS / "scenes.md").read_text(encoding="utf-8")
+    tables = schema.keys(schema.Document)
+    compared = set()
+    # a table of the page, or the rows of one that follow the name of a table of the scene
+    head = r"^\| (?:key of `|\*\*`)\[+(\w+)\]+`.*\n"
+    for name, rows in re.findall(rf"{head}((?:\| `\.?\w.*\n|\|-.*\n)+)", text, re.MULTILINE):
+        model = tables[name].table
+        generated = find_defaults("\n".join(pages._table(model, schema.keys(model))))
+        own = find_defaults(rows)
+        assert own == {key: generated[key] for key in own}, name
+        assert generated.keys() - own.keys() <= {"unit", "note"}, name
+        compared.add(name)
+    assert compared >= {"coordinates", "inputs", "energy", "run", "body", "spring", "force"}
+
+
+def find_defaults(table: str) -> dict[str, str]:
+    """Return the first word of the default of each key in the rows of a table."""
+    words = {"empty": "none", "origins": "origin"}
+    rows = [re.split(r" *(?<!\\)\| *", line)[1:] for line in table.splitlines()]
+    return {
+        key: words.get(first, first)
+        for keys, _, default, *_ in rows
+        if (first := default.removeprefix("the ").strip("`").split(" ")[0].strip(","))
+        for key in re.findall(r"`\.?(\w+)`", keys)
+    }
+
+
 def test_reference_has_every_function_of_the_header(pages: ModuleType) -> None:
     file = DOCS / "reference" / "every_function.toml"
     scene = eomc.read(file)
