@@ -114,47 +114,42 @@ def test_equations_of_a_scene_are_in_the_gallery(pages: ModuleType, tmp_path: Pa
     assert (tmp_path / "a.svg").read_text(encoding="utf-8").startswith("<?xml")
 
 
-@pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The site, built without warnings."""
+@pytest.mark.slow
+def test_site_is_built_without_warnings_and_its_search_finds_tasks(tmp_path: Path) -> None:
     for package in ("sphinx", "myst_nb", "numpydoc", "pydata_sphinx_theme", "sphinx_click"):
         pytest.importorskip(package, reason=f"{package} is not installed: pip install '.[docs]'")
-    folder = tmp_path_factory.mktemp("docs")
+    site = tmp_path / "site"
     command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html"]
     process = subprocess.run(
-        [*command, "-d", folder / "cache", DOCS, folder / "site"], capture_output=True, text=True
+        [*command, "-d", tmp_path / "cache", DOCS, site], capture_output=True, text=True
     )
     assert process.returncode == 0, process.stderr
-    return folder / "site"
-
-
-@pytest.mark.slow
-def test_site_loads_nothing_from_elsewhere(site: Path) -> None:
+    assert (site / "index.html").is_file()
     for page in site.rglob("*.html"):
-        text = page.read_text(encoding="utf-8")
-        loaded = re.findall(
-            r"<(?:script|link|img|iframe)[^>]* (?:src|href)=\"(https?:[^\"]*)", text
-        )
-        assert not loaded, f"{page.name} loads {loaded} from elsewhere"
-        images = re.findall(r'<img[^>]* src="(?!data:)([^"]+)"', text)
-        assert all((page.parent / image).exists() for image in images), page.name
+        check_page(page)
     text = (site / "searchindex.js").read_text(encoding="utf-8")
     index = json.loads(text.removeprefix("Search.setIndex(").removesuffix(")"))
     objects = {f"{part}.{row[4]}" for part, rows in index["objects"].items() for row in rows}
     assert {".arm_integrate", "eomc.load"} <= objects
-    assert (site / "index.html").is_file()
-    search = (site / "search.html").read_text(encoding="utf-8")
-    for script in re.findall(r'<script defer="defer" src="(_static/[^"?]+)', search):
-        assert (site / script).is_file()
+    check_search(site)
 
 
-@pytest.mark.slow
-def test_first_result_of_a_search_answers_the_task(site: Path) -> None:
-    needs("node")
+def check_page(page: Path) -> None:
+    """Check that a page loads nothing from elsewhere, and that what it loads exists."""
+    text = page.read_text(encoding="utf-8")
+    loaded = re.findall(r"<(?:script|link|img|iframe)[^>]* (?:src|href)=\"(https?:[^\"]*)", text)
+    assert not loaded, f"{page.name} loads {loaded} from elsewhere"
+    images = re.findall(r'<img[^>]* src="(?!data:)([^"]+)"', text)
+    scripts = re.findall(r'<script defer="defer" src="([^"?]+)', text)
+    assert all((page.parent / file).exists() for file in (*images, *scripts)), page.name
+
+
+def check_search(site: Path) -> None:
+    """Check that the first result of the search answers nine in ten tasks of users."""
     lines = (ROOT / "tests" / "site_searches.txt").read_text(encoding="utf-8").splitlines()
     tasks = dict(line.split(" | ") for line in lines if " | " in line and line[0] != "#")
     process = subprocess.run(
-        ["node", ROOT / "tests" / "support" / "search_site.js", site / "_static"],
+        [needs("node"), ROOT / "tests" / "support" / "search_site.js", site / "_static"],
         input="\n".join(tasks), capture_output=True, text=True, check=True,
     )  # fmt: skip
     firsts = [(pages or ["nothing"])[0].partition("#")[0] for pages in json.loads(process.stdout)]
