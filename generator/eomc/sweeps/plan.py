@@ -124,9 +124,8 @@ def read_distribution(path: tuple[str, ...], value: Any) -> dict[str, Any]:
     if hasattr(value, "ppf") and hasattr(value, "dist"):
         return _read_frozen(path, value)
     if not (isinstance(value, Mapping) and len(value) == 1):
-        raise SweepError(
-            path, f"give a distribution, such as {{ normal = [2, 0.1] }}, not {value!r}"
-        )
+        example = "give a distribution, such as { normal = [2, 0.1] }"
+        raise SweepError(path, f"{example}, not {value!r}")
     ((kind, numbers),) = value.items()
     check_name(path, kind, DISTRIBUTIONS, f"no distribution {kind!r}")
     names = DISTRIBUTIONS[kind]
@@ -149,9 +148,7 @@ def _read_frozen(path: tuple[str, ...], frozen: Any) -> dict[str, Any]:
     if type(getattr(stats, name, None)) is not type(frozen.dist):
         raise SweepError(path, f"{name} is no distribution of scipy.stats: workers don't have it")
     try:
-        return {
-            "scipy": [name, [float(x) for x in args], {k: float(kwds[k]) for k in sorted(kwds)}]
-        }
+        return {"scipy": [name, [*map(float, args)], {k: float(kwds[k]) for k in sorted(kwds)}]}
     except (TypeError, ValueError):
         raise SweepError(path, f"{name}: give numbers as its arguments, no arrays") from None
 
@@ -169,11 +166,12 @@ def inverse_cdf(distribution: Mapping[str, Any], u: Array) -> Array:
 
         name, args, kwds = numbers
         return np.asarray(getattr(stats, name)(*args, **kwds).ppf(u), float)
-    if kind in ("uniform", "log_uniform"):
+    if kind == "uniform":
         low, high = numbers
-        if kind == "uniform":
-            return np.asarray(low + (high - low) * u)
-        return np.asarray(np.exp(math.log(low) + (math.log(high) - math.log(low)) * u))
+        return np.asarray(low + (high - low) * u)
+    if kind == "log_uniform":
+        low, high = map(math.log, numbers)
+        return np.asarray(np.exp(low + (high - low) * u))
     mean, deviation, *limits = numbers
     if not limits:
         return np.asarray(mean + deviation * ndtri(u))

@@ -68,14 +68,9 @@ def merge(kind: str, numbers: Sequence[float], parts: Any) -> dict[str, Array]:
     """Merge the parts (..., blocks, width) of all blocks; return the results by their endings."""
     if kind == "mean":
         count, mean, squares = np.moveaxis(_merge_tree(np.moveaxis(parts[...], -2, 0)), -1, 0)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            deviation = np.sqrt(squares / (count - 1))
+        deviation = np.sqrt(squares / np.where(count > 1, count - 1, np.nan))
         mean = np.where(count > 0, mean, np.nan)
-        return {
-            "count": count.astype(int),
-            "mean": mean,
-            "std": np.where(count > 1, deviation, np.nan),
-        }
+        return {"count": count.astype(int), "mean": mean, "std": deviation}
     total = sum(parts[..., k, :] for k in range(parts.shape[-2]))
     return {kind: total if kind == "histogram" else _quantiles(total, numbers)}
 
@@ -108,10 +103,8 @@ def _merge_tree(parts: Array) -> Array:
 
 def _merge_pair(a: Array, b: Array) -> Array:
     """Merge moments (..., 3) of two disjoint sets; an empty set changes no bit of the other."""
-    (n, mean, squares), (m, other_mean, other_squares) = (
-        np.moveaxis(a, -1, 0),
-        np.moveaxis(b, -1, 0),
-    )
+    n, mean, squares = np.moveaxis(a, -1, 0)
+    m, other_mean, other_squares = np.moveaxis(b, -1, 0)
     total = n + m
     weight = m / np.maximum(total, 1)
     step = other_mean - mean
@@ -133,15 +126,12 @@ def _quantiles(counts: Array, probabilities: Sequence[float]) -> Array:
     """Return quantiles (..., probabilities) from counts (..., bins): the middle of the bin."""
     totals = np.cumsum(counts, -1)
     ranks = np.asarray(probabilities) * (totals[..., -1:] - 1)
-    rows = zip(
-        totals.reshape(-1, totals.shape[-1]), ranks.reshape(-1, ranks.shape[-1]), strict=True
-    )
-    bins = np.array([np.searchsorted(row, rank, side="right") for row, rank in rows])
+    bins = np.stack([(totals <= rank[..., None]).sum(-1) for rank in np.moveaxis(ranks, -1, 0)], -1)
     keys = np.where(bins < HALF_BINS, HALF_BINS - 1 - bins, bins - HALF_BINS)
     lower = ((keys + LOWEST_KEY) << FRACTION_SHIFT).view(float)
     upper = ((keys + LOWEST_KEY + 1) << FRACTION_SHIFT).view(float)
     values = np.where(keys == 0, 0.0, (lower + upper) / 2) * np.where(bins < HALF_BINS, -1, 1)
-    return np.where(totals[..., -1:] > 0, values.reshape(ranks.shape), np.nan)
+    return np.where(totals[..., -1:] > 0, values, np.nan)
 
 
 NOT_RUN = 255
@@ -266,10 +256,8 @@ def hold_store(path: Path) -> Iterator[None]:
     """
     from eomc.toolchain.cache import hold_lock
 
-    refusal = (
-        f"{texts.line(str(path))}: another sweep writes here: wait for it, or give another store"
-    )
-    with hold_lock(path.with_name(f"{path.name}.lock"), refusal):
+    refusal = "another sweep writes here: wait for it, or give another store"
+    with hold_lock(path.with_name(f"{path.name}.lock"), f"{texts.line(str(path))}: {refusal}"):
         yield
 
 
