@@ -146,11 +146,10 @@ def test_one_runtime_module_names_modules_of_eomc() -> None:
 def test_packages_of_stores_and_clusters_are_imported_in_functions_of_sweeps_only() -> None:
     """Users without the extra `sweep` do without them; they take a second to import."""
     optional = {"zarr", "xarray", "distributed", "pyarrow"}
-    for name, path in modules().items():
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        inside = [f for f in ast.walk(tree) if isinstance(f, ast.FunctionDef)]
+    for name in modules():
+        inside = [f for f in nodes(name) if isinstance(f, ast.FunctionDef)]
         nested = {id(node) for function in inside for node in ast.walk(function)}
-        for node in ast.walk(tree):
+        for node in nodes(name):
             targets = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             if isinstance(node, ast.ImportFrom):
                 targets = [node.module or ""]

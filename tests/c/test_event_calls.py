@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from support.compilation import STRICT, compiled, run
-from support.session import needs
+from support.session import needs, tiers
 
 import eomc
 from eomc.model.system import from_scene
@@ -122,7 +122,7 @@ int main(void)
 
 
 @pytest.mark.parametrize("folder", [".", "fast"])
-@pytest.mark.parametrize("steps", ["fixed", "of both kinds", "adaptive"])
+@pytest.mark.parametrize("steps", tiers(["fixed", "of both kinds", "adaptive"], "of both kinds"))
 def test_calls_have_a_status_that_says_what_happened(
     folder: str, steps: str, tmp_path: Path
 ) -> None:

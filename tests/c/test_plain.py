@@ -230,7 +230,7 @@ def check_plain(name: str, fast: ModuleType, plain: ModuleType, states: int) -> 
 
 
 @pytest.mark.parametrize(
-    "name", tiers([*NAMES, "steppers", "driven", "single", "everything"], "driven")
+    "name", tiers([*NAMES, "steppers", "driven", "single", "everything"], "single")
 )
 def test_both_forms_of_c_agree_with_the_reference(name: str) -> None:
     fast, plain = load_both_forms(name)

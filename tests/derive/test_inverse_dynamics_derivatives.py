@@ -19,7 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import point_masses, trees
 from support.cases import SCENES
-from support.session import Modules
+from support.session import Modules, tiers
 from sympy import S
 from test_newton_euler import FEW, MANY, SPACE, system_from, two_bodies_with
 
@@ -85,6 +85,11 @@ TEXTS = {
     "suspension": (SCENES / "suspension.toml").read_text(encoding="utf-8"),
 }
 
+NAMES = sorted(path.stem for path in SCENES.glob("*.toml"))
+LARGE = (  # of both; they are compared in the slow tier
+    "branches", "massless", "beside", "andrews_squeezer", "bricard", "delta_robot", "rolling_disk",
+)  # fmt: skip
+
 
 def candidates(system: System) -> dict[str, Candidate]:
     """Return the derivatives of the accelerations by each route."""
@@ -120,15 +125,20 @@ def largest_difference(one: Function, other: Function, system: System) -> float:
     return float(max(differences))
 
 
-def assert_routes_agree(system: System) -> None:
-    routes = functions(system)
+def assert_routes_agree(system: System, routes: dict[str, Function]) -> None:
     assert {*routes} == {"forward", "tree"}
     assert largest_difference(*routes.values(), system) < 1e-25
 
 
-@pytest.mark.parametrize("name", TEXTS)
+@cache
+def compared(name: str) -> tuple[System, dict[str, Function]]:
+    system = system_from(TEXTS[name])
+    return system, functions(system)
+
+
+@pytest.mark.parametrize("name", tiers(TEXTS, *(name for name in TEXTS if name not in LARGE)))
 def test_derivatives_of_inverse_dynamics_agree_with_forward_differentiation(name: str) -> None:
-    assert_routes_agree(system_from(TEXTS[name]))
+    assert_routes_agree(*compared(name))
 
 
 @FEW
@@ -153,7 +163,7 @@ def check_text(text: str) -> None:
     except EomcError as error:
         assert "inertia" in str(error)
         return
-    assert_routes_agree(system)
+    assert_routes_agree(system, functions(system))
 
 
 # --- identities -----------------------------------------------------------------------------------
@@ -224,6 +234,7 @@ def test_singular_angles_have_no_derivatives() -> None:
         assert regular is expected, error
 
 
+@pytest.mark.slow
 def test_compiled_module_has_derivatives_along_the_tree(modules: Modules) -> None:
     text = two_bodies_with("spherical", 3) + "\n[run]\nlinearize = true\n"
     built = program.build(lagrange.derive(system_from(text)))
@@ -264,7 +275,7 @@ def linear_text(name: str) -> str:
     return f"{head}\n[run]\nlinearize = true\n{tail}"
 
 
-@pytest.mark.parametrize("name", sorted(path.stem for path in SCENES.glob("*.toml")))
+@pytest.mark.parametrize("name", tiers(NAMES, *(name for name in NAMES if name not in LARGE)))
 def test_derivatives_are_never_dearer_than_one_sided_differences(name: str) -> None:
     """They would take one acceleration at the state, and one for each column."""
     system = from_scene(parse(linear_text(name), f"{name}.toml"))
@@ -288,9 +299,9 @@ LIMITS = {  # operations of the route; more mean that common subexpressions are 
 }
 
 
-@pytest.mark.parametrize("name", LIMITS)
+@pytest.mark.parametrize("name", tiers(LIMITS, "slide-between", "screws", "mimic"))
 def test_operations_of_the_route_do_not_grow(name: str) -> None:
-    assert by_tree(system_from(TEXTS[name])).cost.flops <= LIMITS[name]
+    assert compared(name)[1]["tree"].cost.flops <= LIMITS[name]
 
 
 # --- mutants --------------------------------------------------------------------------------------
@@ -334,12 +345,6 @@ MUTANTS = (  # r1, r2, F1, F2, Psid, Psidd, G, its change of origin, couplings
 SENSITIVE = ("screws", "armature", "coupled", "slide-between")
 
 
-@cache
-def by_forward_differentiation(name: str) -> tuple[System, Function]:
-    system = system_from(TEXTS[name])
-    return system, functions(system)["forward"]
-
-
 @pytest.mark.parametrize(
     ("old", "new"),
     [
@@ -356,7 +361,7 @@ def test_each_term_of_the_derivatives_is_tested(old: str, new: str) -> None:
     exec(source.replace(old, new), mutant.__dict__)
 
     def differs(name: str) -> bool:
-        system, expected = by_forward_differentiation(name)
-        return largest_difference(expected, by_tree(system, mutant), system) > 1e-6
+        system, routes = compared(name)
+        return largest_difference(routes["forward"], by_tree(system, mutant), system) > 1e-6
 
     assert any(map(differs, SENSITIVE))

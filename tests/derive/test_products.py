@@ -244,7 +244,7 @@ class Interpreted:
         return self.product(q, qd, np.hstack(along), **how)
 
 
-@pytest.mark.parametrize("name", PRODUCTS)
+@pytest.mark.parametrize("name", tiers(PRODUCTS, "acceleration_vjp"))
 def test_check_detects_every_wrong_sign_in_a_product(modules: Modules, name: str) -> None:
     text = TURN.replace("*(1 + heaviside(t - 0.5))", "").replace(", limits = [-9, 9]", "")
     module, built = modules.unoptimised(text), build(text)

@@ -16,7 +16,7 @@ from eomc.cli.main import main
 from eomc.identification import FitArguments, Residuals
 
 pytest.importorskip("scipy")
-pytestmark = pytest.mark.usefixtures("quickly_compiled")
+pytestmark = pytest.mark.usefixtures("unoptimised_file")
 
 SCENE = """eomc = 1
 name = "fitted"
@@ -53,9 +53,10 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("fit")
 
 
-@pytest.fixture
-def scene(tmp_path: Path) -> Path:
-    file = tmp_path / "fitted.toml"
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The file of the scene; its path belongs to the identity of a build."""
+    file = tmp_path_factory.mktemp("scene") / "fitted.toml"
     file.write_text(SCENE, encoding="utf-8")
     return file
 
@@ -80,10 +81,23 @@ def simulated_log(
     return {"t": TIMES, "push": push, **noisy}
 
 
+@pytest.fixture(scope="module")
+def simulated(scene: Path, root: Path) -> dict[str, Any]:
+    """The log without noise, simulated once."""
+    return simulated_log(scene, root)
+
+
+@pytest.fixture
+def log(simulated: dict[str, Any]) -> dict[str, Any]:
+    """A copy of the log without noise, which a test may change."""
+    return {name: x.copy() for name, x in simulated.items()}
+
+
 @pytest.mark.parametrize("inputs", ["table", "signals"])
-def test_jacobian_equals_differences(scene: Path, root: Path, inputs: str) -> None:
+def test_jacobian_equals_differences(
+    scene: Path, root: Path, log: dict[str, Any], inputs: str
+) -> None:
     """By parameters, by the start, and by a parameter on which the start depends."""
-    log = simulated_log(scene, root)
     if inputs == "signals":
         del log["push"]
     free = ("l", "theta_dot", "a", "c", "m")
@@ -101,8 +115,7 @@ def test_jacobian_equals_differences(scene: Path, root: Path, inputs: str) -> No
         assert np.abs(J[:, k]).max() > 1e-3
 
 
-def test_exact_log_gives_the_true_values(scene: Path, root: Path) -> None:
-    log = simulated_log(scene, root)
+def test_exact_log_gives_the_true_values(scene: Path, root: Path, log: dict[str, Any]) -> None:
     fit = eomc.fit(scene, log, h=0.002, root=root)
     assert fit.success and not fit.warnings
     assert fit.values == pytest.approx(TRUTH, rel=1e-6)
@@ -113,6 +126,7 @@ def test_exact_log_gives_the_true_values(scene: Path, root: Path) -> None:
     assert start.values == pytest.approx({"theta": 0.3, "theta_dot": 0.3}, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_standard_errors_are_those_of_repeated_experiments(scene: Path, root: Path) -> None:
     """The column with five times the noise has a smaller weight, so both noises are found."""
     free, count = ["m", "l", "c"], 60
@@ -145,8 +159,9 @@ def test_values_that_the_columns_do_not_determine_are_named(scene: Path, root: P
     assert not determined.warnings
 
 
-def test_missing_values_and_other_columns_are_left_out(scene: Path, root: Path) -> None:
-    log = simulated_log(scene, root)
+def test_missing_values_and_other_columns_are_left_out(
+    scene: Path, root: Path, log: dict[str, Any]
+) -> None:
     log["theta"][::3] = np.nan
     log["height"][:40] = np.nan
     log["temperature"] = TIMES
@@ -157,8 +172,7 @@ def test_missing_values_and_other_columns_are_left_out(scene: Path, root: Path) 
     assert f"from {40 + 20 + 120} measured values" in str(fit)
 
 
-def test_estimates_stay_within_bounds(scene: Path, root: Path) -> None:
-    log = simulated_log(scene, root)
+def test_estimates_stay_within_bounds(scene: Path, root: Path, log: dict[str, Any]) -> None:
     fit = eomc.fit(
         scene, log, free=["l"], values=TRUTH | {"l": 1.0}, bounds={"l": (0.9, 2)}, root=root
     )
@@ -186,11 +200,11 @@ def test_estimates_stay_within_bounds(scene: Path, root: Path) -> None:
     ],
 )
 def test_invalid_arguments_are_refused(
-    scene: Path, root: Path, changes: Any, options: Any, message: str
+    scene: Path, root: Path, log: dict[str, Any], changes: Any, options: Any, message: str
 ) -> None:
-    log = {k: x for k, x in (simulated_log(scene, root) | changes).items() if x is not None}
+    changed = {k: x for k, x in (log | changes).items() if x is not None}
     with pytest.raises(EomcError, match=message):
-        eomc.fit(scene, log, root=root, **options)
+        eomc.fit(scene, changed, root=root, **options)
 
 
 def test_some_of_several_inputs_are_refused(tmp_path: Path, root: Path) -> None:
@@ -222,7 +236,7 @@ def test_scenes_with_jumps_are_refused(tmp_path: Path, root: Path) -> None:
     ],
 )
 def test_faulty_files_are_refused(scene: Path, root: Path, text: str | None, message: str) -> None:
-    file = scene.with_name("log.csv")
+    file = scene.with_name("missing.csv" if text is None else "log.csv")
     if text is not None:
         file.write_text(text, encoding="utf-8")
     with pytest.raises(EomcError, match=message):

@@ -8,6 +8,7 @@ of point masses, its pose a product of SciPy's rotations, its velocity a differe
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -162,9 +163,11 @@ def gradient(function: Callable[[Array], float], q: Array) -> Array:
 
 def evaluate_reference(system: System, name: str, q: Array, qd: Array, u: Any = ()) -> Array:
     params = {p.name: p.value for p in system.parameters}
-    return np.asarray(
-        TaylorReference(system).evaluate(name, q, qd, 0.0, np.array(u, dtype=float), params)
-    )
+    reference = _reference(system)
+    return np.asarray(reference.evaluate(name, q, qd, 0.0, np.array(u, dtype=float), params))
+
+
+_reference = lru_cache(maxsize=1)(TaylorReference)  # its functions are compiled once
 
 
 def states(number: int, seed: int = 3) -> list[tuple[Array, Array]]:

@@ -138,6 +138,7 @@ def constant(q: np.ndarray) -> np.ndarray:
     return np.arctan2(np.sin(one) * np.sin(two), np.cos(one) * np.cos(two))
 
 
+@pytest.mark.slow
 def test_dependent_constraints_are_replaced_by_sums() -> None:
     """No two of Bennett's five constraints suffice everywhere; two sums of them do."""
     closure = read(BENNETT).closure

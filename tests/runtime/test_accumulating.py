@@ -7,11 +7,13 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from support.session import tiers
 
 import eomc
 from eomc.model.system import from_scene
 from eomc.scene.read import parse
 
+RUNS = tiers(["", "tolerance = 1e-10"], "tolerance = 1e-10")
 pytestmark = pytest.mark.usefixtures("unoptimised_file")
 BUILDS = Path(__file__).parents[2] / "build" / "tests" / "accumulating"
 BALL = """eomc = 1
@@ -116,7 +118,7 @@ def floor(
     return eomc.load(from_scene(parse(text, "floor.toml")), BUILDS)
 
 
-@pytest.mark.parametrize("run", ["", "tolerance = 1e-10"])
+@pytest.mark.parametrize("run", RUNS)
 def test_run_ends_where_accelerations_drive_a_ball_into_the_floor(run: str) -> None:
     """Regression: after an impact without restitution, the ball fell through the floor."""
     module = floor(run=f"batch = true\n{run}", jump='y_dot = "-e*y_dot"\ncount = "count + 1"')
@@ -139,7 +141,7 @@ def test_event_of_both_directions_ends_the_run_at_a_contact() -> None:
     assert bounces.status == "accumulated" and len(bounces.events["impact"]) == 1
 
 
-@pytest.mark.parametrize("run", ["", "tolerance = 1e-10"])
+@pytest.mark.parametrize("run", RUNS)
 @pytest.mark.parametrize(
     "scene",
     [
@@ -155,13 +157,13 @@ def test_run_goes_on_where_an_event_function_passes_zero(scene: dict[str, str], 
     assert passes.status == "ok" and len(passes.events["impact"]) == 1 and passes["y"][-1] < -1
 
 
-@pytest.mark.parametrize("run", ["", "tolerance = 1e-10"])
+@pytest.mark.parametrize("run", RUNS)
 def test_another_event_at_the_same_time_may_switch_a_mode(run: str) -> None:
     lands = floor(other=LANDS, run=run).simulate()
     assert lands.status == "ok" and abs(lands["y"][-1]) < 1e-6 and lands["held"][-1] == 1
 
 
-@pytest.mark.parametrize("run", ["", "tolerance = 1e-10"])
+@pytest.mark.parametrize("run", RUNS)
 def test_event_function_that_is_not_a_number_ends_the_run(run: str) -> None:
     """Regression: no event was detected, without a message."""
     module = floor(when="log(y) + 5", run=run)
@@ -178,7 +180,7 @@ def test_jump_to_no_finite_state_stores_the_state_once() -> None:
     assert ends.t[-1] == ends.events["impact"].t[-1]
 
 
-@pytest.mark.parametrize("run", ["", "tolerance = 1e-10"])
+@pytest.mark.parametrize("run", RUNS)
 def test_time_of_an_event_is_that_of_its_rows(run: str) -> None:
     """Regression: an event at the end of a run had a time some roundings from the last row's."""
     module = floor(jump='y_dot = "-y_dot"', run=run)

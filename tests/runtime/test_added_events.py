@@ -63,7 +63,9 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def oscillator(scene: Path) -> ModuleType:
-    return eomc.load(scene, scene.parent / "build")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("EOMC_CFLAGS", "-O0")
+        return eomc.load(scene, scene.parent / "build")
 
 
 def test_added_events_are_detected_with_those_of_the_scene(oscillator: ModuleType) -> None:
