@@ -56,7 +56,9 @@ class Fit:
     ambiguous : tuple of str
         Names of values of which only combinations affect the measured columns.
     t : (n,) array
-        Times of the rows, s.
+        Times of the rows, s; those of several logs follow one another.
+    starts : tuple of int
+        Index of the first row of each log.
     measured, fitted : dict of (n,) arrays
         Measured columns by name, nan where a value is missing, and the columns of the model.
     ignored : tuple of str
@@ -81,6 +83,7 @@ class Fit:
     without_effect: tuple[str, ...]
     ambiguous: tuple[str, ...]
     t: Array
+    starts: tuple[int, ...]
     measured: dict[str, Array]
     fitted: dict[str, Array]
     ignored: tuple[str, ...]
@@ -119,7 +122,7 @@ class Fit:
         ]
         wide = max(map(len, [*self.values, *self.measured]))
         for name, value in self.values.items():
-            error, unit = self.standard_errors[name], self.units.get(name, "")
+            error, unit = self.standard_errors[name], self.units.get(name.partition("[")[0], "")
             of = f" ± {error:.2g}" if math.isfinite(error) else ""
             lines.append(f"  {name:{wide}} {value: .9g}{of} {unit}".rstrip())
         if len(self.values) > 1:
@@ -159,7 +162,11 @@ class Fit:
             (colour,) = choose_colours(1)
             for axes, (name, y) in zip(grid, self.measured.items(), strict=True):
                 axes.plot(self.t, y, ".", color="#999999", markersize=3, label="measured")
-                axes.plot(self.t, self.fitted[name], color=colour, label="fitted")
+                ends = (*self.starts[1:], len(self.t))
+                for first, end in zip(self.starts, ends, strict=True):
+                    label = "" if first else "fitted"
+                    line = self.t[first:end], self.fitted[name][first:end]
+                    axes.plot(*line, color=colour, label=label)
                 unit = self.units.get(name, "")
                 axes.set_ylabel(texts.figure(f"{name} ({unit})" if unit else name))
                 axes.grid(color=FAINT)
@@ -176,7 +183,7 @@ def fit(
     bounds: Mapping[str, tuple[float, float]] | None = None, h: float | None = None,
     root: str | Path = "build",
 ) -> Fit:  # fmt: skip
-    """Estimate parameters and initial values of a scene from a log of measured columns.
+    """Estimate parameters and initial values of a scene from logs of measured columns.
 
     The sum of squared residuals, simulated minus measured, is minimised. Columns are weighted by
     the inverse of their noise, which is estimated from their residuals.
@@ -185,18 +192,20 @@ def fit(
     ----------
     scene : path or System
         Scene. It needs no `linearize` and `discretize`, which are added.
-    log : path or mapping
+    log : path, mapping, or a list of these
         A CSV file whose first line has the names of the columns, or the columns by name. `t`, s, is
         required. Measured columns have the names of coordinates, velocities (`theta_dot`) or
         outputs; empty cells and nan are missing values. Columns of inputs are constant from each
-        row to the next; without such columns the inputs follow the scene's signals.
+        row to the next; without such columns the inputs follow the scene's signals. Several logs
+        are experiments with the same parameters; each has its own initial values.
     free : sequence of str, optional
         Names of the estimated values: parameters, and coordinates or velocities, whose initial
-        values are then estimated. By default all parameters.
+        values are then estimated. By default all parameters. With several logs the initial values
+        of `theta` are `theta[1]`, `theta[2]`, ... in the result and in `bounds`.
     values : mapping, optional
         Parameters and initial coordinates and velocities by name, in place of those of the scene:
         initial guesses of free ones. Without it the guess of a free initial coordinate or velocity
-        is its first measured value.
+        is its first measured value. `theta[2]` is that of the second log only.
     bounds : mapping, optional
         (low, high) of free values by name.
     h : float, optional
@@ -220,7 +229,7 @@ def fit(
     except ImportError:
         raise EomcError("fit needs SciPy: pip install scipy") from None
     arguments = FitArguments(scene, free, values or {}, bounds or {}, h, root)
-    problem = arguments.prepare(read_log(log))
+    problem = arguments.prepare(log)
     low, high = problem.check_bounds(arguments.bounds)
     estimates = np.clip(problem.guess, low, high)
     deviations = {name: _deviation(y) for name, y in problem.measured.items()}
@@ -246,7 +255,7 @@ def fit(
     return Fit(
         dict(zip(problem.free, estimates.tolist(), strict=True)),
         dict(zip(problem.free, errors.tolist(), strict=True)),
-        correlation, without_effect, ambiguous, problem.t, problem.measured, fitted,
+        correlation, without_effect, ambiguous, problem.t, problem.starts, problem.measured, fitted,
         problem.ignored, rms, bool(solution.success), solution.message, problem.evaluations,
         problem.units, problem.system.title or problem.system.name,
     )  # fmt: skip
@@ -287,6 +296,33 @@ def read_log(log: Any) -> dict[str, Array]:
     return dict(zip(header, table.T.copy(), strict=True))
 
 
+def read_logs(log: Any) -> tuple[dict[str, Array], tuple[int, ...]]:
+    """Return the columns of one log or several, one after another, and the first row of each log.
+
+    Values of a column that a log does not have are nan. Raises EomcError if a log is invalid.
+    """
+    logs = [read_log(one) for one in (log if isinstance(log, (list, tuple)) else [log])]
+    for k, columns in enumerate(logs):
+        name = f"log {k + 1}" if len(logs) > 1 else "the log"
+        if "t" not in columns:
+            raise EomcError(f"fit: {name} has no column t, but {texts.listed([*columns])}")
+        t = columns["t"]
+        if any(x.shape != t.shape for x in columns.values()) or t.ndim != 1:
+            raise EomcError(f"fit: the columns of {name} have different lengths")
+        if not (np.isfinite(t).all() and (np.diff(t) > 0).all() and len(t) > 1):
+            raise EomcError(f"fit: t of {name} must be finite and ascending, two rows at least")
+    if not logs:
+        raise EomcError("fit: give a log")
+    names = dict.fromkeys(name for columns in logs for name in columns)
+    rows = [len(columns["t"]) for columns in logs]
+    parts = {
+        name: [columns.get(name, np.full(n, np.nan)) for columns, n in zip(logs, rows, strict=True)]
+        for name in names
+    }
+    merged = {name: np.concatenate(columns) for name, columns in parts.items()}
+    return merged, tuple(np.cumsum([0, *rows[:-1]]).tolist())
+
+
 def _deviation(y: Array) -> float:
     """Return the standard deviation of the values of a column, or 1 if they are equal."""
     return float(np.nanstd(y)) or 1.0
@@ -303,8 +339,10 @@ class FitArguments:
     h: float | None
     root: str | Path
 
-    def prepare(self, columns: dict[str, Array]) -> Estimation:
+    def prepare(self, log: Any) -> Estimation:
         """Check the arguments, and build the module with the derivatives that `fit` needs."""
+        columns, starts = read_logs(log)
+        tags = [f"[{k + 1}]" for k in range(len(starts))] if len(starts) > 1 else [""]
         scene = self.scene
         system: System = scene if hasattr(scene, "coordinates") else pipeline.read(scene)
         if jumps := [e.name for e in system.events if e.jump]:
@@ -316,7 +354,8 @@ class FitArguments:
         module: Any = pipeline.load(replace(system, run=run), Path(self.root) / ".fit")
         info = model_of(module).info
         known = (*info.parameters, *info.states)
-        _check_names("values", self.values, known)
+        own_starts = [f"{name}{tag}" for name in info.states for tag in tags]
+        _check_names("values", self.values, (*known, *own_starts))
         names = tuple(info.parameters if self.free is None else self.free)
         _check_names("free", names, known)
         if not names:
@@ -325,10 +364,17 @@ class FitArguments:
             raise EomcError("fit: free: a name is given twice")
         if self.h is not None and not (math.isfinite(self.h) and self.h > 0):
             raise EomcError(f"fit: h = {self.h} is not a step size in s")
-        start = {name: x for name, x in self.values.items() if name in info.states}
-        own = {name: x for name, x in self.values.items() if name not in start}
+        free = [f"{n}{tag}" for n in names for tag in (tags if n in info.states else [""])]
+        own = {name: x for name, x in self.values.items() if name in info.parameters}
         params = {**module.defaults, **own}
-        return Estimation(system, module, columns, names, params, start, self.h or info.h)
+        start = {name: x for name, x in self.values.items() if name not in own}
+        logs = [
+            Log(slice(first, end), tag)
+            for first, end, tag in zip(starts, (*starts[1:], None), tags, strict=True)
+        ]
+        return Estimation(
+            system, module, columns, logs, tuple(free), params, start, self.h or info.h
+        )
 
 
 def _check_names(what: str, names: Iterable[str], known: Sequence[str]) -> None:
@@ -341,17 +387,36 @@ def _check_names(what: str, names: Iterable[str], known: Sequence[str]) -> None:
             raise EomcError(f"fit: {what}: '{name}' is not a value of the scene{remedy}")
 
 
+@dataclass(frozen=True)
+class Log:
+    """The rows of one log, and the end of the names of its initial values, such as "[2]"."""
+
+    rows: slice
+    tag: str
+
+    def names(self, names: Iterable[str]) -> list[str]:
+        """Return names without the tag of this log, and "" for initial values of other logs."""
+        return ["" if "[" in (n := name.removesuffix(self.tag)) else n for name in names]
+
+    def select(self, start: Mapping[str, float]) -> dict[str, float]:
+        """Return the initial values of this log; those with its tag replace those of all logs."""
+        ordered = sorted(start, key=lambda name: "[" in name)
+        named = zip(self.names(ordered), ordered, strict=True)
+        return {name: start[full] for name, full in named if name}
+
+
 @dataclass(eq=False)
 class Estimation:
-    """A scene, the rows of a log, and the values to be estimated.
+    """A scene, the rows of logs, and the values to be estimated.
 
-    columns: those of the log by name. free: names of the estimated values. params, start: fixed
+    columns: those of the logs by name. free: names of the estimated values. params, start: fixed
     values and initial guesses by name. h: step size of the simulations, s.
     """
 
     system: System
     module: Any
     columns: dict[str, Array]
+    logs: list[Log]
     free: tuple[str, ...]
     params: dict[str, float]
     start: dict[str, float]
@@ -361,13 +426,8 @@ class Estimation:
 
     def __post_init__(self) -> None:
         info, columns = self.info, self.columns
-        if "t" not in columns:
-            raise EomcError(f"fit: the log has no column t, but {texts.listed([*columns])}")
         self.t = columns["t"]
-        if any(x.shape != self.t.shape for x in columns.values()) or self.t.ndim != 1:
-            raise EomcError("fit: the columns of the log have different lengths")
-        if not (np.isfinite(self.t).all() and (np.diff(self.t) > 0).all() and len(self.t) > 1):
-            raise EomcError("fit: t of the log must be finite and ascending, two rows at least")
+        self.starts = tuple(log.rows.start for log in self.logs)
         measurable = (*info.states, *info.outputs)
         self.measured = {name: x for name, x in columns.items() if name in measurable}
         known = {"t", *measurable, *info.inputs}
@@ -414,9 +474,16 @@ class Estimation:
     @cached_property
     def guess(self) -> Array:
         """Initial guesses of the free values: given ones, measured ones, those of the scene."""
-        first = {n: x[0] for n, x in self.measured.items() if np.isfinite(x[0])}
-        own = dict(zip(self.info.states, np.ravel(self._state(self.params, {})), strict=True))
-        return np.array([{**own, **first, **self.start, **self.params}[name] for name in self.free])
+        guesses: dict[str, float] = {}
+        for log in self.logs:
+            first = {n: x[log.rows.start] for n, x in self.measured.items()}
+            first = {n: x for n, x in first.items() if np.isfinite(x)}
+            states = np.ravel(self._state(self.params, {}))
+            own = dict(zip(self.info.states, states, strict=True))
+            known = {**own, **first, **log.select(self.start), **self.params}
+            named = zip(self.free, log.names(self.free), strict=True)
+            guesses |= {full: known[name] for full, name in named if name}
+        return np.array([guesses[name] for name in self.free])
 
     def check_bounds(self, bounds: Mapping[str, tuple[float, float]]) -> tuple[Array, Array]:
         """Return the lower and upper bounds of the free values. Raises EomcError."""
@@ -439,26 +506,27 @@ class Estimation:
         )
         return np.array(q, float), np.array(qd, float)
 
-    def _directions(self, params: Mapping[str, float]) -> tuple[Array, Array]:
-        """Return d[q0; qd0]/dv (2 nq, k) and dp/dv (np, k) of the k free values v."""
+    def _directions(
+        self, params: Mapping[str, float], start: Mapping[str, float], free: Sequence[str]
+    ) -> tuple[Array, Array]:
+        """Return d[q0; qd0]/dv (2 nq, k) and dp/dv (np, k) of the k free values v of a log."""
         from sympy import Symbol
 
         from eomc.model.algebra import ALGEBRA
         from eomc.scene import formulas
 
         states, names = self.info.states, self.info.parameters
-        by_start = (np.array(states)[:, None] == self.free).astype(float)
-        constant = {*self.start, *self.free}
+        by_start = (np.array(states)[:, None] == free).astype(float)
+        constant = {*start, *free}
         symbols = {name: Symbol(name, real=True) for name in names}
         at = {symbols[name]: value for name, value in params.items()}
         for name, text in self.info.start_formulas.items():
             if name not in constant:
                 formula = formulas.evaluate(formulas.parse(text), ALGEBRA, symbols.__getitem__)
                 by_start[states.index(name)] = [
-                    float(formula.diff(symbols[v]).subs(at)) if v in symbols else 0.0
-                    for v in self.free
+                    float(formula.diff(symbols[v]).subs(at)) if v in symbols else 0.0 for v in free
                 ]
-        return by_start, (np.array(names)[:, None] == self.free).astype(float)
+        return by_start, (np.array(names)[:, None] == free).astype(float)
 
     def simulate(self, values: Array) -> tuple[dict[str, Array], dict[str, Array]]:
         """Return the measured columns of the model, and their derivatives by the free values.
@@ -466,26 +534,36 @@ class Estimation:
         Raises MotionError if a step fails.
         """
         self.evaluations += 1
-        model, by_name = model_of(self.module), dict(zip(self.free, values.tolist(), strict=True))
+        columns, derivatives = zip(*(self._simulate_log(x, values) for x in self.logs), strict=True)
+        return (
+            {name: np.concatenate([x[name] for x in columns]) for name in self.measured},
+            {name: np.concatenate([x[name] for x in derivatives]) for name in self.measured},
+        )
+
+    def _simulate_log(self, log: Log, values: Array) -> tuple[dict[str, Array], dict[str, Array]]:
+        model, free = model_of(self.module), log.names(self.free)
+        by_name = {n: x for n, x in zip(free, values.tolist(), strict=True) if n}
         params = self.params | {k: v for k, v in by_name.items() if k in self.params}
-        start = self.start | {k: v for k, v in by_name.items() if k not in self.params}
+        start = log.select(self.start)
+        start |= {k: v for k, v in by_name.items() if k not in self.params}
+        t, u = self.t[log.rows], None if self.u is None else self.u[log.rows]
         p = model.arguments.parameters(params)
-        q, qd = np.empty((2, len(self.t), self.info.nq))
+        q, qd = np.empty((2, len(t), self.info.nq))
         q[0], qd[0] = self._state(params, start)
         states = Sensitivity(*model.integrator.propagate(
-            (q, qd), self.t, self.u, p, self.h, self.info.methods[0], has_rows=False
+            (q, qd), t, u, p, self.h, self.info.methods[0], has_rows=False
         ))  # fmt: skip
-        by_start, by_p = self._directions(params)
+        by_start, by_p = self._directions(params, start, free)
         columns = dict(zip(self.info.states, np.hstack([q, qd]).T, strict=True))
         slopes = states.start @ by_start + states.parameters @ by_p
         derivatives = dict(zip(self.info.states, slopes.swapaxes(0, 1), strict=True))
         if self.measured.keys() & {*self.info.outputs}:
-            y = model.functions.output(q, qd, self.t, self.u, p)
+            y = model.functions.output(q, qd, t, u, p)
             columns |= dict(zip(self.info.outputs, y.T, strict=True))
-            of = output_sensitivity(model, states, (q, qd), self.t, self.u, p)
+            of = output_sensitivity(model, states, (q, qd), t, u, p)
             slopes = of.start @ by_start + of.parameters @ by_p
             derivatives |= dict(zip(self.info.outputs, slopes.swapaxes(0, 1), strict=True))
-        return {n: columns[n] for n in self.measured}, {n: derivatives[n] for n in self.measured}
+        return columns, derivatives
 
     def residual_sizes(self, values: Array) -> tuple[dict[str, Array], dict[str, float]]:
         """Return the measured columns of the model, and the RMS of the residuals of each."""

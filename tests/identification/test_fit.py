@@ -93,20 +93,33 @@ def log(simulated: dict[str, Any]) -> dict[str, Any]:
     return {name: x.copy() for name, x in simulated.items()}
 
 
-@pytest.mark.parametrize("inputs", ["table", "signals"])
+@pytest.fixture
+def two_logs(log: dict[str, Any]) -> list[dict[str, Any]]:
+    """The beginning and the end of the log, which overlap; the second has two columns less."""
+    return [
+        {name: x[:35] for name, x in log.items()},
+        {name: x[30:] for name, x in log.items() if name not in ("height", "theta_dot")},
+    ]
+
+
+@pytest.mark.parametrize("inputs", ["table", "signals", "two logs"])
 def test_jacobian_equals_differences(
-    scene: Path, root: Path, log: dict[str, Any], inputs: str
+    scene: Path, root: Path, log: dict[str, Any], two_logs: list[dict[str, Any]], inputs: str
 ) -> None:
     """By parameters, by the start, and by a parameter on which the start depends."""
     if inputs == "signals":
         del log["push"]
-    free = ("l", "theta_dot", "a", "c", "m")
-    problem = FitArguments(scene, free, {}, {}, None, root).prepare(log)
+    free, count = ("l", "theta_dot", "a", "c", "m"), 4 * len(TIMES)
+    logs = two_logs if inputs == "two logs" else log
+    problem = FitArguments(scene, free, {}, {}, None, root).prepare(logs)
+    if inputs == "two logs":
+        count = 4 * 35 + 2 * 30
+        assert problem.free == ("l", "theta_dot[1]", "theta_dot[2]", "a", "c", "m")
     residuals = Residuals(problem, dict.fromkeys(COLUMNS, 2.0))
     values, width = problem.guess + 0.01, 1e-3
     J = residuals.jacobian(values)
-    assert J.shape == (4 * len(TIMES), 5)
-    for k, direction in enumerate(width * np.eye(5)):
+    assert J.shape == (count, len(values))
+    for k, direction in enumerate(width * np.eye(len(values))):
         expected = sum(
             w * (residuals(values + j * direction) - residuals(values - j * direction))
             for j, w in ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
@@ -124,6 +137,54 @@ def test_exact_log_gives_the_true_values(scene: Path, root: Path, log: dict[str,
     options: dict[str, Any] = {"free": ["theta", "theta_dot"], "values": TRUTH | {"theta": 0.1}}
     start = eomc.fit(scene, log, **options, h=0.002, root=root)
     assert start.values == pytest.approx({"theta": 0.3, "theta_dot": 0.3}, rel=1e-6)
+
+
+def test_several_logs_have_their_own_initial_values(
+    scene: Path, root: Path, log: dict[str, Any], two_logs: list[dict[str, Any]]
+) -> None:
+    first, logs = log, two_logs
+    values = {"theta": 0.2, "theta[2]": 0.1, "theta_dot[2]": -0.5, "m": 1.0}
+    free, limits = ["m", "l", "theta", "theta_dot"], {"theta_dot[2]": (-9.0, 9.0)}
+    fit = eomc.fit(scene, logs, free=free, values=TRUTH | values, bounds=limits, h=0.002, root=root)
+    starts = {f"{n}[{k}]": first[n][row] for n in free[2:] for k, row in ((1, 0), (2, 30))}
+    expected = {"m": TRUTH["m"], "l": TRUTH["l"], **starts}
+    assert fit.success and not fit.warnings
+    assert fit.values == pytest.approx(expected, rel=1e-6)
+    assert fit.starts == (0, 35) and len(fit.t) == len(fit.fitted["theta"]) == 65
+    assert np.isnan(fit.measured["height"][35:]).all()
+    assert "from 200 measured values" in str(fit) and "rad/s" in str(fit)
+    pair = {"values": TRUTH | {"theta_dot[2]": starts["theta_dot[2]"]}, "h": 0.002, "root": root}
+    guess = eomc.fit(scene, logs, free=["theta"], **pair)  # from the first row of each log
+    assert guess.values["theta[2]"] == pytest.approx(first["theta"][30], rel=1e-6)
+    right = {f"{n}[2]": starts[f"{n}[2]"] for n in free[2:]}
+    fixed = eomc.fit(scene, logs, free=["l"], values=TRUTH | right | {"theta": 0.3}, root=root)
+    assert fixed.rms["theta"] < 1e-5
+    measured = [x["theta"][0] for x in logs]
+    for guesses, expected in ({}, measured), ({"theta[2]": 0.4}, [measured[0], 0.4]):
+        arguments = FitArguments(scene, ("theta",), guesses, {}, None, root)
+        assert [*arguments.prepare(logs).guess] == expected
+    logs[1]["t"] = logs[1]["t"][::-1]
+    with pytest.raises(EomcError, match="t of log 2 must be finite and ascending"):
+        eomc.fit(scene, logs, root=root)
+    with pytest.raises(EomcError, match="bounds: 'theta' is not a value of the scene; did you mea"):
+        eomc.fit(scene, logs[:1] * 2, free=["theta"], bounds={"theta": (0, 1)}, root=root)
+    with pytest.raises(EomcError, match="give a log"):
+        eomc.fit(scene, [], root=root)
+
+
+def test_second_log_can_continue_the_first(scene: Path, root: Path) -> None:
+    """With signals, which depend on time."""
+    log = {"t": TIMES, "theta": 0 * TIMES, "theta_dot": 0 * TIMES}
+    (whole, _) = FitArguments(scene, ("m",), {}, {}, None, root).prepare(log).simulate(np.ones(1))
+    module: Any = eomc.load(scene, root)
+    run = module.simulate(t0=TIMES[0], times=TIMES, h=0.001, params={"m": 1.0})
+    np.testing.assert_allclose(whole["theta"], run["theta"], atol=1e-6)
+    start = {f"{name}[2]": x[30] for name, x in whole.items()}
+    logs = [log, {name: x[30:] for name, x in log.items()}]
+    problem = FitArguments(scene, ("m",), start, {}, None, root).prepare(logs)
+    both, _ = problem.simulate(np.ones(1))
+    for name, x in whole.items():
+        np.testing.assert_array_equal(both[name], [*x, *x[30:]])
 
 
 @pytest.mark.slow
@@ -265,6 +326,10 @@ def test_command_prints_estimates_and_draws_the_fit(scene: Path, root: Path) -> 
     summary = json.loads(command(scene, root, *words, "--json").output)
     assert summary["values"]["l"] == pytest.approx(0.7, abs=0.01)
     assert summary["success"] and summary["rms"].keys() == {*COLUMNS}
+    log = str(scene.with_name("log.csv"))
+    both = json.loads(command(scene, root, log, *words, "--json", "--plot", str(png)).output)
+    assert both["values"].keys() == {"l", "theta_dot[1]", "theta_dot[2]"}
+    assert both["values"]["theta_dot[2]"] == pytest.approx(both["values"]["theta_dot[1]"], abs=1e-9)
     unknown = command(scene, root, "--free", "l,k")
     assert unknown.exit_code == 2 and "free: 'k' is not a value of the scene" in unknown.output
     wrong = command(scene, root, "--bounds", "l=3")

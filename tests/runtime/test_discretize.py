@@ -250,7 +250,8 @@ def test_inputs_and_parameters_per_state(modules: Modules, period: float | None)
     q, qd = np.array([Q, 2 * Q, -Q]), np.array([QD, -QD, QD])
     u, k = np.array([[0.0, 0.1], [1.0, 0.2], [-2.0, 0.3]]), np.array([4.0, 5.0, 6.0])
     by_name, t = {"force": u[:, 0], "push": 0.2}, np.array([0.0, 0.1, 0.2])
-    options_by_name: dict[str, Any] = {"discretize": {"control_period": period}, "linearize": {}}
+    period_options = {"control_period": period, "parameters": True}
+    options_by_name: dict[str, Any] = {"discretize": period_options, "linearize": {}}
     for u_all, params in (
         (u, None),
         (u.tolist(), {"k": k}),

@@ -604,7 +604,7 @@ def _print_sweep_end(command: SimpleNamespace, path: Path, state: SweepProgress)
 
 @click.command("fit")
 @options.SCENE
-@click.argument("log", type=options.PATH)
+@click.argument("log", type=options.PATH, nargs=-1, required=True)
 @options.BUILD
 @click.option(
     "--free", metavar="NAME,...",
@@ -622,7 +622,7 @@ def _print_sweep_end(command: SimpleNamespace, path: Path, state: SweepProgress)
 @options.JSON
 @options.as_namespace
 def fit_command(arguments: SimpleNamespace) -> None:
-    """Estimate parameters from measured columns; LOG is a CSV file.
+    """Estimate parameters from measured columns; each LOG is a CSV file, an experiment.
 
     The first line of LOG has the names of the columns: t, and coordinates, velocities (theta_dot),
     outputs or inputs of the scene.

@@ -178,7 +178,7 @@ class Integrator(Component):
             State before the step, or n states.
         h : float, optional
             Step size, s; by default that of the scene.
-        t : float
+        t : float or (n,) array_like
             Time at the start of the step, s.
         u : (nu,) or (n, nu) array_like or mapping, optional
             Inputs, constant over the step. By default the step follows the scene's signals
