@@ -153,6 +153,9 @@ SETUPS: dict[str, Setup] = {
         "run.vjp": lambda: {
             "cartpole": load("cartpole_driven", linearize='"products"'), "u": np.zeros((200, 1))
         },
+        "of the time of the first impact": lambda: {
+            "ball": ball(linearize='"products"')
+        },
         "arm.discretize": _discrete,
         "solve_discrete_are": _balance,
         "u=actions": _balance,
@@ -173,6 +176,9 @@ SETUPS: dict[str, Setup] = {
     "pictures.md": {"other_run": _pictures},
     "plotting.md": {"masses": _many},
     "sweeps.md": {"policy=policy": _policy},
+    "optimisation.md": {
+        "pitch.simulate": lambda: {"pitch": load(scene_of_page("optimisation.md", '"pitch"'))}
+    },
 }  # fmt: skip
 
 

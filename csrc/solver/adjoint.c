@@ -4,10 +4,11 @@
  * 247). The name x_bar stands for the derivative of that function with respect to x.
  */
 
-/* A run with fixed steps: n-th step from t0 + n h, with row n/hold of the table u of inputs. */
+/* A run with fixed steps, the n-th from t0 + n h, or with steps of any sizes, with row n/hold of the table u of inputs. */
 typedef struct {
     real t0, h;
     long steps, every; /* there is a row after each `every` steps, and after the last step */
+    const real *times; /* of the rows, one after each step of any size; NULL: all steps are of size h */
 #if EOM_INPUTS
     const real *u; /* NULL: the scene's signals, at each stage */
     long hold;
@@ -17,6 +18,7 @@ typedef struct {
 /* Derivatives with respect to the present state, to the inputs of each row of the table, and to the parameters. */
 typedef struct {
     real *q, *qd;
+    real *t; /* those with respect to the times of the first and of the last row; NULL: they are not needed */
 #if EOM_INPUTS
     real *u;
 #endif
@@ -24,6 +26,18 @@ typedef struct {
     real *p;
 #endif
 } eom_adjoint_sums;
+
+/* The time at the start of the n-th step. */
+static real eom_adjoint_time(const eom_adjoint_run *run, long n)
+{
+    return run->times ? run->times[n] : run->t0 + (real)n*run->h;
+}
+
+/* The size of the n-th step. */
+static real eom_adjoint_size(const eom_adjoint_run *run, long n)
+{
+    return run->times ? run->times[n + 1] - run->times[n] : run->h;
+}
 
 #if EOM_IMPLICIT
 /* Whether an iteration has converged: a sweep changes values by rounding, relative to their size (sums of magnitudes). */
@@ -98,16 +112,17 @@ static eom_status eom_method_record_steps(real *records, long first, long n, con
 
     for (long k = 0; k < n; k++) {
         real *const q = records + RECORD*k, *const qd = q + NQ, *const a = qd + NQ, *const next = a + S*NQ;
+        const real h = eom_adjoint_size(run, first + k);
         eom_status status;
 
 #if EOM_INPUTS
         own.u = run->u ? run->u + EOM_NU*((first + k)/run->hold) : run->u;
         m = &own;
 #endif
-        status = eom_method_find_stages(a, q, qd, run->t0 + (real)(first + k)*run->h, run->h, m);
+        status = eom_method_find_stages(a, q, qd, eom_adjoint_time(run, first + k), h, m);
         if (status)
             return status;
-        eom_method_end_state(next, next + NQ, a, q, qd, run->h);
+        eom_method_end_state(next, next + NQ, a, q, qd, h);
     }
     return EOM_OK;
 }
@@ -195,23 +210,103 @@ static eom_status eom_method_pull_back_all_stages(real *bars, const real *a_bars
 }
 
 #endif
-/* Replace the derivatives with respect to the end of a recorded step by those with respect to its start. */
-static eom_status eom_method_pull_back_step(const eom_adjoint_sums *to, const real *record, real t, real h, const eom_model *m)
+#if EOM_DRIVEN
+/*
+ * The derivative of the accelerations times qdd_bar with respect to the time t, by differences of fourth order in parts
+ * of the step size h, times h: as small as they are, their errors are rounding errors of the accelerations.
+ */
+static eom_status eom_pull_back_time(real *by_time, const real *qdd_bar, const real *q, const real *qd, real t, real h, const eom_model *m)
+{
+    static const real PARTS = 64, OFFSETS[4] = { -2, -1, 1, 2 }, WEIGHTS[4] = { 1, -8, 8, -1 };
+
+    *by_time = 0;
+    for (int n = 0; n < 4; n++) {
+        real qdd[EOM_WIDTH] = { 0 };
+        const eom_status status = eom_accelerate(qdd, q, qd, t + OFFSETS[n]*h/PARTS, m);
+
+        if (status)
+            return status;
+        for (int k = 0; k < EOM_NQ; k++)
+            *by_time += PARTS*WEIGHTS[n]/12*qdd_bar[k]*qdd[k];
+    }
+    return EOM_OK;
+}
+
+#endif
+/*
+ * t_bar += the derivatives with respect to the times t of the start and t + h of the end of a recorded step. q_bar, qd_bar: those
+ * with respect to its end. bars: as above.
+ */
+static eom_status eom_method_pull_back_times(real *t_bar, const real *q_bar, const real *qd_bar, const real *bars, const real *record, real t, real h, const eom_model *m)
+{
+    enum { NQ = EOM_NQ, S = EOM_METHOD_STAGES, W = EOM_VARIABLES };
+    const real *const qd = record + NQ, *const a = qd + NQ;
+    real by_size = 0, by_start = 0;
+
+    for (int i = 0; i < S; i++) {
+        const real *const A = eom_method_A[i], *const AA = eom_method_AA[i], *const bar = bars + W*i;
+#if EOM_DRIVEN
+        real qdd_bar[NQ], r[NQ], v[NQ], by_time; /* by the accelerations, divided by h; the state at the stage */
+        eom_status status;
+#endif
+
+        for (int k = 0; k < NQ; k++) {
+            const real end_bar = 2*h*eom_method_bA[i]*q_bar[k] + eom_method_b[i]*qd_bar[k];
+            real r_rate = eom_method_c[i]*qd[k], v_rate = 0; /* of the state at the stage, by h */
+
+            for (int j = 0; j < S; j++) {
+                r_rate += 2*h*AA[j]*a[NQ*j + k];
+                v_rate += A[j]*a[NQ*j + k];
+            }
+            by_size += end_bar*a[NQ*i + k] + bar[k]*r_rate + bar[NQ + k]*v_rate;
+        }
+#if EOM_DRIVEN
+        for (int k = 0; k < NQ; k++) {
+            qdd_bar[k] = h*eom_method_bA[i]*q_bar[k] + eom_method_b[i]*qd_bar[k];
+            for (int j = 0; j < S; j++)
+                qdd_bar[k] += h*eom_method_AA[j][i]*bars[W*j + k] + eom_method_A[j][i]*bars[W*j + NQ + k];
+        }
+        eom_method_stage_state(r, v, a, i, S, record, qd, h);
+        status = eom_pull_back_time(&by_time, qdd_bar, r, v, t + eom_method_c[i]*h, h, m);
+        if (status)
+            return status;
+        by_size += eom_method_c[i]*by_time;
+        by_start += by_time;
+#endif
+    }
+    for (int k = 0; k < NQ; k++)
+        by_size += q_bar[k]*qd[k];
+    t_bar[0] += by_start - by_size;
+    t_bar[1] += by_size;
+#if !EOM_DRIVEN
+    (void)t;
+    (void)m;
+#endif
+    return EOM_OK;
+}
+
+/*
+ * Replace the derivatives with respect to the end of a recorded step by those with respect to its start. t_bar: as
+ * above; NULL: those with respect to the times are not needed.
+ */
+static eom_status eom_method_pull_back_step(const eom_adjoint_sums *to, const real *record, real t, real h, const eom_model *m, real *t_bar)
 {
     enum { NQ = EOM_NQ, S = EOM_METHOD_STAGES, W = EOM_VARIABLES };
     real a_bars[S*NQ], bars[S*(W)];
     eom_status status;
 
-    for (int k = 0; k < NQ; k++) {
+    for (int k = 0; k < NQ; k++)
         for (int i = 0; i < S; i++)
             a_bars[NQ*i + k] = h*(h*eom_method_bA[i]*to->q[k] + eom_method_b[i]*to->qd[k]);
-        to->qd[k] += h*to->q[k];
-    }
 #if EOM_IMPLICIT
     status = eom_method_pull_back_all_stages(bars, a_bars, record, t, h, m);
 #else
     status = eom_method_pull_back_stages(bars, a_bars, record, t, h, m);
 #endif
+    if (status == EOM_OK && t_bar)
+        status = eom_method_pull_back_times(t_bar, to->q, to->qd, bars, record, t, h, m);
+    for (int k = 0; k < NQ; k++)
+        to->qd[k] += h*to->q[k];
     for (int i = 0; i < S && status == EOM_OK; i++) {
         const real *const bar = bars + W*i;
 
@@ -241,8 +336,10 @@ static eom_status eom_method_pull_back_steps(const eom_adjoint_sums *to, const r
 #endif
 
     for (long k = n - 1; k >= 0; k--) {
+        const real t = eom_adjoint_time(run, first + k), h = eom_adjoint_size(run, first + k);
+        const int starts = first + k == 0, ends = first + k == run->steps - 1;
+        real t_bar[2] = { 0, 0 };
         eom_status status;
-
 #if EOM_INPUTS
         const long row = (first + k)/run->hold;
 
@@ -250,9 +347,13 @@ static eom_status eom_method_pull_back_steps(const eom_adjoint_sums *to, const r
         m = &own;
         sums.u = to->u + EOM_NU*row;
 #endif
-        status = eom_method_pull_back_step(&sums, records + RECORD*k, run->t0 + (real)(first + k)*run->h, run->h, m);
+        status = eom_method_pull_back_step(&sums, records + RECORD*k, t, h, m, to->t && (starts || ends) ? t_bar : 0);
         if (status)
             return status;
+        if (to->t) {
+            to->t[0] += starts ? t_bar[0] : 0;
+            to->t[1] += ends ? t_bar[1] : 0;
+        }
     }
     return EOM_OK;
 }

@@ -97,10 +97,10 @@ def write(folder: Path, real: str = "double") -> None:
 
 
 EVERY = """D C g bias tau kinetic_energy potential_energy energy power outputs output_slopes events
-jumps applied signal signal_vjp sensitivity output_sensitivity acceleration acceleration_jvp
-acceleration_vjp linearization adaptive rk4_step rk4_run rk4_derivative dp8_step dp8_run
-dp8_derivative gauss4_step gauss4_run gauss4_derivative gauss16_step gauss16_run gauss16_derivative
-euler_step euler_run euler_derivative""".split()
+event_slopes jumps jump_vjp applied signal signal_vjp sensitivity output_sensitivity acceleration
+acceleration_jvp acceleration_vjp linearization adaptive rk4_step rk4_run rk4_derivative dp8_step
+dp8_run dp8_derivative gauss4_step gauss4_run gauss4_derivative gauss16_step gauss16_run
+gauss16_derivative euler_step euler_run euler_derivative""".split()
 
 
 @pytest.mark.parametrize("real", tiers(["double", "float"], "double"))

@@ -215,6 +215,31 @@ def signal_vjp(system: System) -> tuple[Tape, Vector]:
     return derived.tape, _pull_back(system, derived.tape, derived.values, system.u)
 
 
+def gradients(system: System, tape: Tape, sums: Sequence[Sequence[tuple[Expr, Expr]]]) -> Vector:
+    """Return the gradients of weighted sums of values by [q, qd, u, p, t], one after the other.
+
+    A sum consists of pairs (value, weight). sign and heaviside are piecewise constant: their
+    derivatives are 0.
+    """
+    saved, tape.constant_leaves = tape.constant_leaves, tape.find_jumps()
+    variables, least = (*_variables(system), t), LEAST_ROOT[system.run.real]
+    rows = [tape.gradient(pairs, variables, least=least) for pairs in sums]
+    tape.constant_leaves = saved
+    return tuple(x for row in rows for x in row)
+
+
+def jump_vjp(system: System, tape: Tape, values: Sequence[Expr]) -> Vector:
+    """Return w^T J for the states after jumps, with their derivatives J by [q, qd, u, p, t].
+
+    values: the state [q, qd] after the jump of each event. The components of w are the symbols of q
+    and qd with the suffix `ALONG`.
+    """
+    weights = _vector_symbols(tape, (*system.q, *system.qd))
+    n = len(weights)
+    states = [values[k : k + n] for k in range(0, len(values), n)]
+    return gradients(system, tape, [[*zip(x, weights, strict=True)] for x in states])
+
+
 def _variables(system: System) -> tuple[Symbol, ...]:
     """Return the symbols of q, qd, u and the parameters."""
     return (*system.q, *system.qd, *system.u, *(p.symbol for p in system.parameters))

@@ -197,6 +197,11 @@ class Tape:
                 self._rhs[symbol] = Mul(*(Pow(x, e) for x, e in self.powers[symbol].items()))
         return self._rhs[symbol]
 
+    def find_jumps(self) -> frozenset[Symbol]:
+        """Return the names that are defined as a sign or heaviside."""
+        jumps = (sympy.sign, sympy.Heaviside)
+        return frozenset(name for name, rhs in self._rhs.items() if isinstance(rhs, jumps))
+
     def _name(self, rhs: Expr) -> Symbol:
         """Return the name of a function of atoms, a new one where it is not defined yet."""
         name = self._known.get(rhs)

@@ -234,6 +234,15 @@ def _events(system: System, taken: Candidate) -> Iterator[Function]:
             replace(system, outputs=formula_outputs), with_derivatives=False, base=known
         )
         yield lower(name, derived.tape, derived.values, system.names)
+        if system.run.linearize != "products" or system.constraints or name == "begins":
+            continue
+        if name == "jumps":
+            products = outputs.jump_vjp(system, derived.tape, derived.values)
+            yield lower("jump_vjp", derived.tape, products, system.names)
+        else:
+            sums = [[(value, S.One)] for value in derived.values]
+            slopes = outputs.gradients(system, derived.tape, sums)
+            yield lower("event_slopes", derived.tape, slopes, system.names)
 
 
 def _requested(system: System) -> Iterator[Function]:

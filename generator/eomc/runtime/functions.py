@@ -80,6 +80,9 @@ FUNCTIONS: Mapping[str, StateFunction] = {
     "reactions": StateFunction(lambda m: (len(m.constraints.loops), m.frame_size), of_inputs=False),
     "events": StateFunction(lambda m: (len(m.events),)),
     "jumps": StateFunction(lambda m: (len(m.events), 2 * m.nq)),
+    "event_slopes": StateFunction(
+        lambda m: (len(m.events), 2 * m.nq + m.nu + len(m.parameters) + 1)
+    ),
 }
 
 
@@ -699,7 +702,7 @@ class Functions(Component):
             for i, (k, x) in enumerate(zip(sizes, parts, strict=True))
         ]
         direction = np.concatenate(vector, axis=-1)
-        return self._product("acceleration_jvp", q, qd, direction, self.nq, (t, u, params))
+        return self.product("acceleration_jvp", q, qd, direction, self.nq, (t, u, params))
 
     def acceleration_vjp(
         self, q: ArrayLike, qd: ArrayLike, qdd_bar: ArrayLike, t: float = 0.0, u: Any = None,
@@ -741,10 +744,10 @@ class Functions(Component):
         n, m = self.nq, self.info.nu
         weights = self.arguments.for_each_state(qdd_bar, "qdd_bar", (n,), q)
         width = 2 * n + m + len(self.info.parameters)
-        bar = self._product("acceleration_vjp", q, qd, weights, width, (t, u, params))
+        bar = self.product("acceleration_vjp", q, qd, weights, width, (t, u, params))
         return tuple(np.split(bar, [n, 2 * n, 2 * n + m], axis=-1))
 
-    def _product(
+    def product(
         self, name: str, q: ArrayLike, qd: ArrayLike, vector: Array, width: int,
         conditions: tuple[Any, Any, Any],
     ) -> Array:  # fmt: skip

@@ -146,7 +146,7 @@ class Trajectory(Columns):
 
     def _states_after_rows(self, times: Array) -> Array:
         """Return the states at times, by steps from the row before each."""
-        model, request = self.model, self._replayed_request()
+        model, request = self.model, self.replayed_request()
         rows, u = np.empty((2, len(times), model.info.nq), model.info.dtype), request.u
         whole, rest = split_times(times, request.t0, request.h, self.steps)
         for k, (n, left) in enumerate(zip(whole.tolist(), rest.tolist(), strict=True)):
@@ -163,7 +163,7 @@ class Trajectory(Columns):
             rows[:, k] = q, qd
         return rows
 
-    def _replayed_request(self) -> Request:
+    def replayed_request(self) -> Request:
         """Return the request with the stored inputs in place of a function of inputs."""
         if isinstance(self.request.u, str) and self.request.u == NOT_STORED:
             raise ValueError(NOT_STORED)
@@ -178,7 +178,7 @@ class Trajectory(Columns):
         runs have both rows of each jump. A function of inputs is not called again, as its values
         are stored.
         """
-        request = self._replayed_request()
+        request = self.replayed_request()
         if not request.has_equal_steps:
             times = None if times is None else times.astype(self.model.info.dtype)
             request = request.replace(t_end=request.t_end if end is None else end)
@@ -315,18 +315,26 @@ class Trajectory(Columns):
             "multipliers and reactions are not unique there"
         )
 
-    def vjp(self, q_bar: ArrayLike | None, qd_bar: ArrayLike | None = None) -> RunGradient:
+    def vjp(
+        self, q_bar: ArrayLike | None = None, qd_bar: ArrayLike | None = None, *,
+        events: Mapping[str, tuple[ArrayLike | None, ...]] | None = None,
+    ) -> RunGradient:  # fmt: skip
         """Return the gradient of a scalar function of the rows: start, inputs and parameters.
 
         The gradient is that of the steps themselves (discrete adjoint), exact to rounding, at the
         cost of a few runs, whatever the number of inputs and parameters. Memory is bounded: the
-        steps between two rows are made again in parts.
+        steps between two rows are made again in parts. The gradient includes the event times: the
+        rows at a state jump and at a stop follow the event. All other times, such as those of
+        adaptive steps, are constant.
 
         Parameters
         ----------
         q_bar, qd_bar : (n, nq) array_like or None
             Derivatives of the function with respect to the positions and velocities at the rows;
             None: zeros.
+        events : mapping, optional
+            Derivatives of the function with respect to the occurrences of events: a tuple
+            (t_bar, q_bar, qd_bar) for `run.events[name]` by the name of each event; None: zeros.
 
         Returns
         -------
@@ -337,12 +345,13 @@ class Trajectory(Columns):
         Raises
         ------
         MotionError
-            If a derivative is not finite, or if the fixed-point iterations of an implicit method do
-            not converge, as in stiff motions.
+            If a derivative is not finite, if the fixed-point iterations of an implicit method do
+            not converge, as in stiff motions, or if an event function only grazes zero.
         ValueError
-            If the module was built without Jacobian products, or if the run has no adjoint: that
-            of adaptive steps, with rows at requested times, with constraints or with events that
-            occurred.
+            If the module was built without Jacobian products, or if the run has no adjoint, such
+            as one with constraints.
+        KeyError
+            If the name of an event is unknown.
 
         Notes
         -----
@@ -355,7 +364,7 @@ class Trajectory(Columns):
         """
         from .sensitivity import pull_back
 
-        return pull_back(self, self._replayed_request(), q_bar, qd_bar)
+        return pull_back(self, self.replayed_request(), q_bar, qd_bar, events)
 
     def balance(self) -> Balance | None:
         """Return the energy balance of the run, J, with the numerical error that follows from it.
@@ -377,7 +386,8 @@ class Trajectory(Columns):
         """Return forward sensitivities: the derivatives of the rows by start, inputs, parameters.
 
         They are the products of the derivatives of the steps from row to row, exact to rounding for
-        a run by fixed steps.
+        a run by fixed steps. The rows at a state jump and at a stop follow the event: their
+        derivatives include those of the event time. All other times are constant.
 
         Parameters
         ----------
@@ -399,14 +409,33 @@ class Trajectory(Columns):
         Raises
         ------
         MotionError
-            If a derivative is not finite.
+            If a derivative is not finite, or if an event function only grazes zero.
         ValueError
-            If the module was built without derivatives of steps, the state jumps at an event, or
-            the inputs are a function.
+            If the module was built without derivatives of steps, or without Jacobian products where
+            the state jumps or an event ends the run, or if the inputs are a function.
         """
         from .sensitivity import sensitivity
 
         return sensitivity(self, outputs, h, method)
+
+    def event_sensitivity(self) -> dict[str, Sensitivity]:
+        """Return forward sensitivities of the occurrences of each event, by its name.
+
+        Returns
+        -------
+        dict of Sensitivity
+            Derivatives of [t; q; qd] at the m occurrences, with the state before a state jump:
+            `start` (m, 1 + 2 nq, 2 nq), `inputs` (m, 1 + 2 nq, nu) and `parameters`
+            (m, 1 + 2 nq, np), as in `sensitivity`.
+
+        Raises
+        ------
+        MotionError, ValueError
+            As `sensitivity`.
+        """
+        from .sensitivity import event_sensitivity
+
+        return event_sensitivity(self)
 
     def plot(
         self, *names: str, phase: Any = None, section: Mapping[str, Array] | None = None,

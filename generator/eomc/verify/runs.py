@@ -29,8 +29,15 @@ from eomc.model.symbols import Output
 from eomc.runtime.package import model_of
 from eomc.verify import reference
 from eomc.verify.comparison import LIMIT, Check, Comparison
-from eomc.verify.equations import Formulas, output_error
-from eomc.verify.reference import Vector
+from eomc.verify.equations import (
+    SLOPE_LIMIT,
+    UNIT,
+    WIDTHS,
+    Formulas,
+    output_error,
+    relative_differences,
+)
+from eomc.verify.reference import Vector, differences
 from eomc.verify.sampling import (
     MAX_DISTANCE,
     NUDGE,
@@ -367,6 +374,49 @@ def event_function_checks(comparison: Comparison) -> Iterator[Check]:
                 name, partial(output_error, formulas, partial(_event_values, name, len(outputs))),
                 states=comparison.few(4), portable=True,
             )  # fmt: skip
+
+    if system.run.linearize == "products" and not system.constraints:
+        yield Check(
+            "derivatives of events", event_slope_error, states=comparison.few(4), unit=UNIT,
+            tolerance=max(SLOPE_LIMIT, LIMIT * comparison.eps),
+            why="no state has finite differences",
+        )  # fmt: skip
+
+
+def event_slope_error(of: Comparison, e: Expected) -> float | None:
+    """Return the largest error of the derivatives of event functions and jumps at a state.
+
+    They are compared with differences of the module's functions, of several widths, by [q, qd, u,
+    p, t]. None if the differences are not finite or contain a jump.
+    """
+    functions, s = model_of(of.module).functions, e.state
+    n, m, params = 2 * len(s.q), len(of.system.inputs), dict(s.params or of.sampler.defaults)
+    x = np.concatenate([s.q, s.qd, np.ones(m) if s.u is None else s.u, [*params.values()], [s.t]])
+    scales = np.concatenate([of.sampler.scale.ravel(), np.maximum(1.0, np.abs(x[n:]))])
+    names = ["events", *(["jumps"] if any(e.action == "jump" for e in of.system.events) else [])]
+
+    def values(rows: Vector) -> Vector:
+        q, qd, u, p, t = np.split(rows, [n // 2, n, n + m, len(x) - 1], axis=1)
+        here = t[:, 0], u if m else None, dict(zip(params, p.T, strict=True))
+        parts = [functions.evaluate(name, q, qd, *here) for name in names]
+        return np.hstack([np.reshape(part, (len(rows), -1)) for part in parts])
+
+    here = s.t, x[n : n + m] if m else None, params
+    slopes = [functions.evaluate("event_slopes", s.q, s.qd, *here)]
+    if "jumps" in names:
+        q, qd = (np.tile(half, (n, 1)) for half in (s.q, s.qd))
+        count, along = len(of.system.events), np.eye(n, len(x) - 1).astype(of.dtype)
+        rows = functions.product("jump_vjp", q, qd, along, count * len(x), here)
+        slopes.append(rows.reshape(n, count, -1).swapaxes(0, 1).reshape(n * count, -1))
+    size = np.abs(values(x[None])[0])
+    with np.errstate(all="ignore"):
+        near = [differences(values, x, width * scales) for width in WIDTHS]
+        off = [relative_differences(np.vstack(slopes), J, scales, size) for J in near]
+        first, last = (np.abs(near[k]) * scales * WIDTHS[k] for k in (0, -1))
+        if (last > 0.1 * first + 1e-9 * np.max(size)).any():  # a jump map jumps at the state
+            return None
+    least = np.fmin.reduce(off)
+    return float(np.max(least, initial=0)) if np.all(least >= 0) else None
 
 
 def _event_values(name: str, count: int, of: Comparison, s: State) -> Vector:

@@ -8,6 +8,7 @@
 #ifndef EOM_PARAMETERS
 #define EOM_PARAMETERS 0
 #endif
+#define EOM_DRIVEN 1
 #include "model.h"
 
 #include "check.h"
@@ -58,16 +59,17 @@ static eom_status eom_evaluate_acceleration_vjp(real *bar, const real *q, const 
 enum { STEPS = 38, HOLD = 4, MAX_ROWS = STEPS + 1, INPUT_ROWS = (STEPS + HOLD - 1)/HOLD };
 
 static const real T0 = (real)0.1, H = (real)0.05;
+static real times[STEPS + 1]; /* at the starts of the steps, and at the end */
 static real q_rows[EOM_NQ*MAX_ROWS], qd_rows[EOM_NQ*MAX_ROWS], q_bars[EOM_NQ*MAX_ROWS], qd_bars[EOM_NQ*MAX_ROWS];
 
-static eom_status advance(real *q, real *qd, real t, const eom_model *m)
+static eom_status advance(real *q, real *qd, real t, real h, const eom_model *m)
 {
 #if EOM_IMPLICIT
     long evaluations = 0;
 
-    return eom_gauss_advance(q, qd, t, H, m, &evaluations);
+    return eom_gauss_advance(q, qd, t, h, m, &evaluations);
 #else
-    return eom_explicit_advance(q, qd, t, H, m);
+    return eom_explicit_advance(q, qd, t, h, m);
 #endif
 }
 
@@ -89,12 +91,15 @@ static real run_steps(const real *x, const real *u, long every, real damping)
         }
         m.u = EOM_INPUTS ? u + n/HOLD : NULL;
         if (n < STEPS)
-            CHECK(advance(q, qd, T0 + (real)n*H, &m) == EOM_OK, n);
+            CHECK(advance(q, qd, times[n], times[n + 1] - times[n], &m) == EOM_OK, n);
     }
     return sum;
 }
 
-/* Compare the adjoint of a run with rows after each `every` steps with central differences. */
+/*
+ * Compare the adjoint of a run with rows after each `every` steps with central differences. With a row after each step,
+ * the steps have various sizes.
+ */
 static void compare(long every)
 {
 #ifdef SINGLE
@@ -104,10 +109,16 @@ static void compare(long every)
 #endif
     const eom_model m = { .kind = COUPLED, .c = (real)0.25 };
     real work[(EOM_METHOD_STAGES + 4)*(STEPS + 1)*EOM_NQ], gradient[4 + INPUT_ROWS + 1] = { 0 };
-    real values[4 + INPUT_ROWS + 1], *const p_bar = gradient + 4 + INPUT_ROWS;
+    real values[4 + INPUT_ROWS + 1], *const p_bar = gradient + 4 + INPUT_ROWS, t_bar[2] = { 0, 0 };
     eom_adjoint_run run = { .t0 = T0, .h = H, .steps = STEPS, .every = every };
     eom_adjoint_sums to = { .q = gradient, .qd = gradient + 2 };
 
+    for (int n = 0; n <= STEPS; n++)
+        times[n] = T0 + (real)n*H + (every == 1 ? (real)(n % 3)*H/8 : 0);
+    if (every == 1) {
+        run.times = times;
+        to.t = t_bar;
+    }
     for (int i = 0; i < 4 + INPUT_ROWS; i++)
         values[i] = (real)draw();
     values[4 + INPUT_ROWS] = m.c;
@@ -138,6 +149,17 @@ static void compare(long every)
         slope = (slope - run_steps(values, values + 4, every, values[4 + INPUT_ROWS]))/(2*by);
         values[i] = value;
         CHECK(eom_fabs(gradient[i] - slope) < tolerance*(1 + eom_fabs(slope)), gradient[i] - slope);
+    }
+    for (int i = 0; i < 2 && every == 1; i++) {
+        real *const time = times + (i ? STEPS : 0), value = *time;
+        real slope;
+
+        *time = value + by;
+        slope = run_steps(values, values + 4, every, m.c);
+        *time = value - by;
+        slope = (slope - run_steps(values, values + 4, every, m.c))/(2*by);
+        *time = value;
+        CHECK(eom_fabs(t_bar[i] - slope) < tolerance*(1 + eom_fabs(slope)), t_bar[i] - slope);
     }
 }
 

@@ -98,6 +98,12 @@ KINDS: Mapping[str, Kind] = {
         "For events that may occur at the start: positive if so; -1 for other events."),
     "jumps": Kind("after", "e*2*n", "qd u",
         "State [q; qd] after each event whose action is a jump."),
+    "event_slopes": Kind("slopes", "e*x+e", "qd u",
+        "Derivatives of the event functions by [q, qd, u, p, t], by rows."),
+    "jump_vjp": Kind("bar", "e*x+e", "qd along u",
+        "Vector-Jacobian products: for each event bar = J^T w, with the derivatives J by "
+        "[q, qd, u, p, t] of the state [q; qd] after its jump, and the entries w of `along` for q "
+        "and qd.", refuses=True),
     "frame_poses": Kind("poses", "f*pose", "", "Pose of each frame: {pose}."),
     "frame_velocities": Kind("velocities", "f*twist", "qd",
         "Twist of each frame: {twist}, along the world's axes."),
@@ -181,6 +187,7 @@ def c_array_size(target: Target, shape: str) -> str:
         "y*p": f"{NY}*{np}",
         "e": NE,
         "e*2*n": f"{NE}*2*{NQ}",
+        "e*x+e": f"{NE}*(2*{NQ}{f' + {NU}' * bool(s.inputs)} + {np + 1})",
         "f*pose": f"{NF}*{pose}",
         "f*twist": f"{NF}*{twist}",
         "f*twist*n": f"{NF}*{twist}*{NQ}",
@@ -417,12 +424,14 @@ class Public:
         bars += [output_array(real, "u_bar")] if target.system.inputs else []
         count = len(target.system.parameters)
         bars += [output_array(real, "p_bar", str(count))] if count else []
+        bars += [output_array(real, "t_bar", "2")]
         rows = (input_array(real, name) for name in ("q_rows", "qd_rows", "q_bars", "qd_bars"))
         numbers = (CArgument("long", name) for name in ("steps", "every"))
         hold = [CArgument("long", "hold")] if target.system.inputs else []
         return self._status(
             f"{method}_adjoint", *bars, *rows, *self.arguments("t", "h"), *numbers,
-            *self.arguments("u"), *hold, *self.arguments("p"), output_array(real, "work"),
+            input_array(real, "times"), *self.arguments("u"), *hold, *self.arguments("p"),
+            output_array(real, "work"),
         )  # fmt: skip
 
     @property

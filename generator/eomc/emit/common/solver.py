@@ -506,6 +506,7 @@ def run_adjoints(model: SolverModel) -> Iterator[str]:
         "INPUTS": bool(target.system.inputs),
         "FEEDBACK": functions.public.has("signal_vjp"),
         "PARAMETERS": bool(target.system.parameters),
+        "DRIVEN": target.driven,
         "CONSTRAINTS": False,
     }
     exact = {
