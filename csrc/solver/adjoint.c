@@ -27,12 +27,14 @@ typedef struct {
 #endif
 } eom_adjoint_sums;
 
+#if EOM_DRIVEN
 /* The time at the start of the n-th step. */
 static real eom_adjoint_time(const eom_adjoint_run *run, long n)
 {
     return run->times ? run->times[n] : run->t0 + (real)n*run->h;
 }
 
+#endif
 /* The size of the n-th step. */
 static real eom_adjoint_size(const eom_adjoint_run *run, long n)
 {
@@ -336,7 +338,7 @@ static eom_status eom_method_pull_back_steps(const eom_adjoint_sums *to, const r
 #endif
 
     for (long k = n - 1; k >= 0; k--) {
-        const real t = eom_adjoint_time(run, first + k), h = eom_adjoint_size(run, first + k);
+        const real h = eom_adjoint_size(run, first + k);
         const int starts = first + k == 0, ends = first + k == run->steps - 1;
         real t_bar[2] = { 0, 0 };
         eom_status status;
@@ -347,7 +349,7 @@ static eom_status eom_method_pull_back_steps(const eom_adjoint_sums *to, const r
         m = &own;
         sums.u = to->u + EOM_NU*row;
 #endif
-        status = eom_method_pull_back_step(&sums, records + RECORD*k, t, h, m, to->t && (starts || ends) ? t_bar : 0);
+        status = eom_method_pull_back_step(&sums, records + RECORD*k, eom_adjoint_time(run, first + k), h, m, to->t && (starts || ends) ? t_bar : 0);
         if (status)
             return status;
         if (to->t) {
