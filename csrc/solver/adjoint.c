@@ -27,14 +27,6 @@ typedef struct {
 #endif
 } eom_adjoint_sums;
 
-#if EOM_DRIVEN
-/* The time at the start of the n-th step. */
-static real eom_adjoint_time(const eom_adjoint_run *run, long n)
-{
-    return run->times ? run->times[n] : run->t0 + (real)n*run->h;
-}
-
-#endif
 /* The size of the n-th step. */
 static real eom_adjoint_size(const eom_adjoint_run *run, long n)
 {
@@ -121,7 +113,7 @@ static eom_status eom_method_record_steps(real *records, long first, long n, con
         own.u = run->u ? run->u + EOM_NU*((first + k)/run->hold) : run->u;
         m = &own;
 #endif
-        status = eom_method_find_stages(a, q, qd, eom_adjoint_time(run, first + k), h, m);
+        status = eom_method_find_stages(a, q, qd, run->times ? run->times[first + k] : run->t0 + (real)(first + k)*run->h, h, m);
         if (status)
             return status;
         eom_method_end_state(next, next + NQ, a, q, qd, h);
@@ -349,7 +341,7 @@ static eom_status eom_method_pull_back_steps(const eom_adjoint_sums *to, const r
         m = &own;
         sums.u = to->u + EOM_NU*row;
 #endif
-        status = eom_method_pull_back_step(&sums, records + RECORD*k, eom_adjoint_time(run, first + k), h, m, to->t && (starts || ends) ? t_bar : 0);
+        status = eom_method_pull_back_step(&sums, records + RECORD*k, run->times ? run->times[first + k] : run->t0 + (real)(first + k)*run->h, h, m, to->t && (starts || ends) ? t_bar : 0);
         if (status)
             return status;
         if (to->t) {
