@@ -362,11 +362,11 @@ def _body_regressor(w: Array, a: Array, alpha: Array) -> Array:
     All components are along the body's axes. w: angular velocity. a: acceleration of the origin
     less that of gravity. alpha: angular acceleration. The result is (..., 6, 10).
     """
-    turn, rate, lever = (np.einsum("ijk,...j->...ik", CROSS, v) for v in (w, alpha, a))
+    turn, rate, lever = (np.tensordot(v, CROSS, (-1, 1)) for v in (w, alpha, a))
     out = np.zeros((*w.shape[:-1], 6, len(PARAMETERS)))
     out[..., :3, 0] = a
     out[..., :3, 1:4] = rate + turn @ turn
     out[..., 3:, 1:4] = -lever
-    inertia = [np.einsum("ijk,...j->...ik", TENSOR, v) for v in (w, alpha)]
+    inertia = [np.tensordot(v, TENSOR, (-1, 1)) for v in (w, alpha)]
     out[..., 3:, 4:] = inertia[1] + turn @ inertia[0]
     return out
