@@ -134,6 +134,7 @@ def test_explicit_positions_are_recognised(relative: bool) -> None:
     assert_agrees_with_lagrange(read_system(links([-1, 0, 0, 2], False, relative, written=True)))
 
 
+@pytest.mark.slow
 @FEW
 @given(st.data())
 def test_random_tree_of_links_agrees_with_lagrange(data: Any) -> None:

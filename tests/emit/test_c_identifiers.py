@@ -91,6 +91,7 @@ def test_enumerators_are_not_macros() -> None:
             assert c_names.may_be_enumerator_of_others(macro), macro
 
 
+@cache
 def program_from(text: str) -> dict[str, str]:
     return dict(eomc.sources(system.from_scene(scene.parse(text, "names.toml"))).files)
 

@@ -189,6 +189,7 @@ def test_tendons_and_gravity_compensation_are_energies(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_sum_of_many_weights_can_be_parsed(tmp_path: Path) -> None:
     bodies = '<body name="a" gravcomp="1" pos="1 0 0"><joint/><geom size="0.1"/>'.replace(
         ' name="a"', ""

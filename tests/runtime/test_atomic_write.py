@@ -92,7 +92,13 @@ def test_new_file_replaces_the_old_one_and_keeps_its_mode(
     assert [*tmp_path.iterdir()] == [file]
 
 
-@pytest.mark.parametrize("name", [n for n in WRITERS if n not in ("run.pdf", "run.gif")])
+@pytest.mark.parametrize(
+    "name",
+    tiers(
+        (n for n in WRITERS if n not in ("run.pdf", "run.gif")),
+        *(n for n in WRITERS if n not in SLOW),
+    ),
+)
 def test_scene_or_file_of_another_kind_is_not_replaced(name: str, run: Any, tmp_path: Path) -> None:
     """This holds for any suffix and through a link; an empty file may be replaced."""
     file, link = tmp_path / name, tmp_path / f"link{Path(name).suffix}"
