@@ -173,7 +173,8 @@ def test_fixed_values_that_contradict_a_row_are_named_with_their_error() -> None
     system = scene("x = { start = 0.7 }\ny = { start = 0.8 }", 'rod = "x**2 + y**2 - 1"')
     text = refusal(system)
     assert text.startswith(
-        "made.toml:8:1: error: constraints.rod: can't be zero with x = 0.7, y = 0.8 held: "
+        "made.toml:8:1: error: constraints.rod: cannot be satisfied with the fixed values "
+        "x = 0.7, y = 0.8: "
     )
     assert "y would have to be 0.7141 (-0.086), or x would have to be 0.6 (-0.1)" in text
     assert "guess = true" in text
@@ -181,9 +182,7 @@ def test_fixed_values_that_contradict_a_row_are_named_with_their_error() -> None
 
 def test_fixed_values_that_contradict_jointly_are_named() -> None:
     system = scene("x = { start = 3.0 }\ny = { start = 4.0 }", 'rod = "x**2 + y**2 - 1"')
-    assert "nor with one of them let go: together x would have to be 0.6 (-2.4), y" in refusal(
-        system
-    )
+    assert "nor if one of them changes: x would have to be 0.6 (-2.4), y" in refusal(system)
 
 
 def test_fixed_velocities_that_contradict_a_row_are_named() -> None:
@@ -192,15 +191,20 @@ def test_fixed_velocities_that_contradict_a_row_are_named() -> None:
         'rod = "x**2 + y**2 - 1"',
     )
     text = refusal(system)
-    assert "constraints.rod: changes at the start, with x_dot = 1, y_dot = 1 held" in text
+    assert (
+        "constraints.rod: cannot be satisfied with the fixed velocities x_dot = 1, y_dot = 1"
+        in text
+    )
     assert "y_dot would have to be -0.75 (-1.8), or x_dot would have to be -1.333 (-2.3)" in text
 
 
 def test_contradictory_rows_are_named() -> None:
     system = scene("x = { guess = true }\ny = {}", 'one = "x - 1"\ntwo = "x - 2"')
     text = refusal(system)
-    assert "constraints.one: contradicts two: where they are least, one is 0.5, two is -0.5" in text
-    assert "None changes alone: leave one out, or correct a formula" in text
+    assert (
+        "constraints.one: contradicts two: the smallest residuals are one = 0.5, two = -0.5" in text
+    )
+    assert "Remove one of them, or correct a formula" in text
 
 
 @pytest.mark.parametrize(
@@ -211,38 +215,36 @@ def test_two_lengths_of_one_rod_are_contradictory(fixed_coordinates: str) -> Non
     text = refusal(
         scene(f"{fixed_coordinates}\ny = {{ guess = true, start = -0.8 }}\nz = {{}}", rods)
     )
-    assert "constraints.rod: contradicts rod2: where they are least, rod is 0.2" in text
-    assert "leave one out" in text and "ground" not in text and "x = 0.6" not in text
+    assert "constraints.rod: contradicts rod2: the smallest residuals are rod = 0.2" in text
+    assert "Remove one of them" in text and "ground" not in text and "x = 0.6" not in text
 
 
 def test_only_contradictory_rows_are_named() -> None:
     rows = 'low = "z"\na = "x - 0.6"\nb = "y - 0.1"\nhigh = "z - y"\nc = "y - z + 1"'
     text = refusal(scene("x = {}\ny = {}\nz = {}", rows))
-    assert "constraints.low: contradicts b, high: where they are least" in text
-    assert "None changes alone: leave one out" in text
+    assert "constraints.low: contradicts b, high: the smallest residuals are" in text
+    assert "Remove one of them" in text
 
 
 def test_rows_with_contradictory_velocities_are_named() -> None:
     two = refusal(scene("x = {}\ny = {}", 'one = "x - t"\ntwo = "x - 2*t"\nground = "y"'))
-    assert (
-        "constraints.one: contradicts two: no rates keep them zero. None changes alone: leave one"
-        in two
-    )
+    assert "constraints.one: contradicts two: no velocities satisfy them. Remove one of them" in two
     rows = 'rod = "x**2 + y**2 - 1"\na = "x - 0.6"\nb = "y + 0.8 - 0.1*t"\nground = "z"'
     three = refusal(scene("x = { start = 0.6 }\ny = { start = -0.8 }\nz = {}", rows))
     assert (
-        "constraints.rod: contradicts a, b: no rates keep them zero. None changes alone: leave one"
-        in three
+        "constraints.rod: contradicts a, b: no velocities satisfy them. Remove one of them" in three
     )
     text = refusal(scene("x = { rate = 3.0 }", 'one = "x - t"\ntwo = "x - 2*t"'))
-    assert "constraints.one: contradicts two: no rates keep them zero" in text
+    assert "constraints.one: contradicts two: no velocities satisfy them" in text
 
 
 def test_velocities_forbidden_by_a_singular_position_are_reported() -> None:
     rows = 'rod = "x**2 + y**2 - 1"\nlift = "y - 1 + 0.1*t"'
     text = refusal(scene("x = { start = 0.0 }\ny = { start = 1.0 }", rows))
-    assert "constraints.rod: changes at the start together with lift, and no rates mend it" in text
-    assert "the start is a singular position. Start beside it, or correct a formula" in text
+    assert (
+        "constraints.rod: cannot be satisfied together with lift by any initial velocities" in text
+    )
+    assert "the initial position is singular. Choose one nearby, or correct a formula" in text
 
 
 @pytest.mark.parametrize("coupler", [0.6, 0.4])
@@ -263,18 +265,24 @@ def test_loop_that_cannot_close_is_refused() -> None:
         "x = { start = 1.4, guess = true }\ny = { start = 0.1, guess = true }",
         'one = "x**2 + y**2 - 1"\ntwo = "(x - 3)**2 + y**2 - 1"',
     )
-    assert "constraints.one: can't be zero together with two near the start" in refusal(system)
+    assert (
+        "constraints.one: cannot be satisfied together with two near the initial state"
+        in refusal(system)
+    )
 
 
 def test_row_undefined_at_the_initial_position_is_refused() -> None:
     system = scene("x = { start = -1.0, guess = true }\ny = {}", 'root = "sqrt(x) - y"')
     text = refusal(system)
-    assert "constraints.root: has no value at x = -1, y = 0: start where it has one" in text
+    assert (
+        "constraints.root: has no value at x = -1, y = 0: choose an initial state where it has one"
+        in text
+    )
 
 
 def test_row_without_a_gradient_at_the_initial_position_is_refused() -> None:
     system = scene("x = {}\ny = {}\nz = {}", 'root = "sqrt(x) - y"\nground = "z"')
-    assert "constraints.root: has no slope at x = 0, y = 0: start where" in refusal(system)
+    assert "constraints.root: has no derivative at x = 0, y = 0: choose an" in refusal(system)
 
 
 def test_initial_position_with_undefined_energy_is_refused() -> None:
@@ -282,7 +290,7 @@ def test_initial_position_with_undefined_energy_is_refused() -> None:
     system = replace(
         system, kinetic=system.kinetic + sympy.sqrt(symbol("x")) * symbol("x_dot") ** 2
     )
-    assert "energy.kinetic: has no value at the start, x = -1, y = 0" in refusal(system)
+    assert "energy.kinetic: has no value at the initial state, x = -1, y = 0" in refusal(system)
 
 
 def test_row_independent_of_coordinates_is_refused() -> None:
@@ -304,9 +312,11 @@ def test_nonsmooth_row_is_refused_by_name(formula: str) -> None:
 @pytest.mark.parametrize(
     ("formula", "remedy"),
     [
-        ("(x - y)**2", "write x - y for (x - y)**2"),
-        pytest.param("(x**2 - y)**3", "write x**2 - y for (x**2 - y)**3", marks=pytest.mark.slow),
-        ("x**2 - 2*x*y + y**2", "write x - y for x**2 - 2*x*y + y**2"),
+        ("(x - y)**2", "write x - y in place of (x - y)**2"),
+        pytest.param(
+            "(x**2 - y)**3", "write x**2 - y in place of (x**2 - y)**3", marks=pytest.mark.slow
+        ),
+        ("x**2 - 2*x*y + y**2", "write x - y in place of x**2 - 2*x*y + y**2"),
     ],
 )
 def test_row_with_zero_gradient_where_it_is_satisfied_is_refused(
@@ -314,20 +324,23 @@ def test_row_with_zero_gradient_where_it_is_satisfied_is_refused(
 ) -> None:
     rows = f'ground = "z"\nflat = "{formula}"'
     text = refusal(scene(f"x = {{ {start} }}\ny = {{ guess = true }}\nz = {{}}", rows))
-    assert f"constraints.flat: has no slope where it holds, and so no force: {remedy}" in text
+    assert (
+        f"constraints.flat: has a zero gradient where it is satisfied, so no force: {remedy}"
+        in text
+    )
     assert "ground" not in text and not recwarn
 
 
 @pytest.mark.parametrize(
     ("formula", "remedy"),
     [
-        ("(x - y)**2", "write x - y for (x - y)**2"),
-        ("-3*(x - y)**2", "write x - y for -3*(x - y)**2"),
-        ("(x - y)**2 + (z - 1)**4", "write each thing that is zero by itself"),
-        ("gap", "write each thing that is zero by itself"),
-        ("x*x - 2*x*y + y*y", "write x - y for x**2 - 2*x*y + y**2"),
+        ("(x - y)**2", "write x - y in place of (x - y)**2"),
+        ("-3*(x - y)**2", "write x - y in place of -3*(x - y)**2"),
+        ("(x - y)**2 + (z - 1)**4", "write an equation for each quantity that is zero"),
+        ("gap", "write an equation for each quantity that is zero"),
+        ("x*x - 2*x*y + y*y", "write x - y in place of x**2 - 2*x*y + y**2"),
         ("sin(x)**2 + 2*x*sin(y) - 2*x*sin(x) + x**2 - 2*sin(x)*sin(y) + sin(y)**2", "write "),
-        ("x**3 - 3*x**2*y + 3*x*y**2 - y**3", "write x - y for x**3"),
+        ("x**3 - 3*x**2*y + 3*x*y**2 - y**3", "write x - y in place of x**3"),
     ],
 )
 def test_row_with_zero_gradient_is_refused_at_a_fixed_initial_position(
@@ -336,7 +349,9 @@ def test_row_with_zero_gradient_is_refused_at_a_fixed_initial_position(
     fixed_coordinates = "x = { start = 1.0 }\ny = { start = 1.0 }\nz = { start = 1.0 }"
     more = '[definitions]\ngap = "(x - y)**2"' if formula == "gap" else ""
     text = refusal(scene(fixed_coordinates, f'rod = "{formula}"', more))
-    assert f"constraints.rod: has no slope where it holds, and so no force: {remedy}" in text
+    assert (
+        f"constraints.rod: has a zero gradient where it is satisfied, so no force: {remedy}" in text
+    )
 
 
 @pytest.mark.slow
@@ -451,9 +466,7 @@ def test_unconstrained_coordinates_without_inertia_are_named() -> None:
     """SymPy once raised "Invalid NaN comparison" here."""
     system = scene("x = {}\nv = {}\nw = {}", 'r = "v - w"')
     system = replace(system, kinetic=system.coordinates[0].qd ** 2 / 2)
-    assert "coordinates.v: v, w can move together without moving anything that has" in refusal(
-        system
-    )
+    assert "coordinates.v: v, w can move together without moving mass or inertia" in refusal(system)
     assert assembled(replace(system, kinetic=sum(c.qd**2 for c in system.coordinates[:2]))).closure
 
 
@@ -585,7 +598,4 @@ def test_hinge_is_closed_with_axes_in_the_same_direction() -> None:
 def test_initially_singular_angles_are_named() -> None:
     """The message once asked for a mass."""
     message = refusal(from_scene(parse(welded([0, 1, 0], np.pi / 2))))
-    assert (
-        "the mass matrix is singular, though it is not nearby" in message
-        and "quaternion" in message
-    )
+    assert "the mass matrix is singular, but not nearby" in message and "quaternion" in message

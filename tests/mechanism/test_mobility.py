@@ -464,7 +464,9 @@ def test_loop_is_closed_by_the_nearest_rotation():
         assert [w.key for w in system.warnings if w.severity == "warning"] == []
         assert system.coordinates[2].start == pytest.approx(0.2, abs=1e-14)
     fixed_text = text.replace("ANGLE, guess = true", "ANGLE").replace("ANGLE", "3.2")
-    with pytest.raises(SceneError, match=r"with a = 3\.2, b = 0\.2 held: a would have to be 0\.2"):
+    with pytest.raises(
+        SceneError, match=r"with the fixed values a = 3\.2, b = 0\.2: a would have to be 0\.2"
+    ):
         assembled(from_scene(parse(fixed_text)))
 
 

@@ -45,7 +45,7 @@ def test_project_is_checked_without_and_with_fixed_coordinates() -> None:
     results = rows(right)
     assert all(row.passed and row.error < 2 for row in results.values())
     assert {len(names) for names in right.fixed_names} == {0, 2}
-    for count, fails in ((0, "project"), (2, "project, held")):
+    for count, fails in ((0, "project"), (2, "project, fixed values")):
         results = rows(Projecting((count,)))
         assert [name for name, row in results.items() if not row.passed] == [fails]
 
@@ -57,5 +57,5 @@ def test_change_of_a_fixed_coordinate_fails() -> None:
             return result * (1 + 4e-16) if how["fixed"] else result
 
     results = rows(ChangesFixed())
-    assert [name for name, row in results.items() if not row.passed] == ["project, held"]
-    assert np.isinf(results["project, held"].error)
+    assert [name for name, row in results.items() if not row.passed] == ["project, fixed values"]
+    assert np.isinf(results["project, fixed values"].error)

@@ -28,8 +28,8 @@ from eomc.runtime import rank
 VIOLATED_FRACTION = 0.01  # residuals below this fraction of the largest one are not reported
 MAX_RELEASED_VALUES = 12  # fixed values that are released one by one
 MAX_PROPOSALS = 3  # values that a message proposes
-NO_SINGLE_CHANGE = "None changes alone: leave one out, or correct a formula or a parameter"
-SEPARATE_TERMS = "each thing that is zero by itself, x and y for x**2 + y**2"
+NO_SOLUTION = "Remove one of them, or correct a formula or a parameter"
+SEPARATE_TERMS = "an equation for each quantity that is zero, x and y for x**2 + y**2"
 MAX_FORMULA_LENGTH = 60  # characters of a formula in a message
 
 
@@ -82,8 +82,8 @@ def position_problems(
     others = _together_with(system.constraints, rows)
     if proposed:
         message = (
-            f"can't be zero{others} with {fixed_values} held: {proposed}. Correct a start, or "
-            "let it move: guess = true"
+            f"cannot be satisfied{others} with the fixed values {fixed_values}: {proposed}. "
+            "Correct an initial value, or let assembly change it: guess = true"
         )
     else:
         closest, converged = _closest(manifold, np.ones(len(free), dtype=bool), configuration)
@@ -95,8 +95,9 @@ def position_problems(
             for k in involved
         ]
         message = (
-            f"can't be zero{others} with {fixed_values} held, nor with one of them let go: "
-            f"together {', '.join(changes)}. Correct them, or let them move: guess = true"
+            f"cannot be satisfied{others} with the fixed values {fixed_values}, nor if one of them "
+            f"changes: {', '.join(changes)}. Correct them, or let assembly change them: "
+            "guess = true"
         )
     yield system.problem(scene_key(row), message)
 
@@ -138,13 +139,13 @@ def velocity_problems(
     fixed_values = listed([f"{system.coordinates[k].name}_dot = {rates[k]:.6g}" for k in involved])
     if proposed:
         message = (
-            f"changes at the start{others}, with {fixed_values} held: {proposed}. Correct "
-            "a rate, or leave it out, and it follows"
+            f"cannot be satisfied{others} with the fixed velocities {fixed_values}: {proposed}. "
+            "Correct a rate, or omit it, so that it is computed"
         )
     else:
         message = (
-            f"changes at the start{others}, with {fixed_values} held, nor does one of "
-            "them alone mend it: leave them out, and they follow"
+            f"cannot be satisfied{others} with the fixed velocities {fixed_values}, nor if one of "
+            "them changes: omit them, so that they are computed"
         )
     yield system.problem(scene_key(row), message)
 
@@ -180,20 +181,20 @@ def _inconsistent(manifold: Manifold, rows: Sequence[int], configuration: Config
     clash = _contradictory(B, scaled, max(accuracy, rank.tolerance()))
     rows = [holonomic[k] for k in clash] or rows
     residuals = ", ".join(
-        f"{constraints[k].name} is {configuration.phi[k]:.2g}" for k in rows[:MAX_PROPOSALS]
+        f"{constraints[k].name} = {configuration.phi[k]:.2g}" for k in rows[:MAX_PROPOSALS]
     )
     row, others = constraints[rows[0]], _together_with(constraints, rows)
     if len(rows) > 1 and _alike(manifold, rows, configuration):
         message = (
-            f"contradicts {_names(constraints, rows[1:])}: where they are least, {residuals}. "
-            f"{NO_SINGLE_CHANGE}"
+            f"contradicts {_names(constraints, rows[1:])}: the smallest residuals are {residuals}. "
+            f"{NO_SOLUTION}"
         )
     else:
-        leave = ", leave one out," if others else ""
+        leave = ", remove one," if others else ""
         message = (
-            f"can't be zero{others} near the start: the search for a position ends where "
-            f"{residuals}. Correct a formula or a parameter{leave} or start closer to a position "
-            "that closes"
+            f"cannot be satisfied{others} near the initial state: the search for a position ends "
+            f"with {residuals}. Correct a formula or a parameter{leave} or choose an initial state "
+            "nearer to a solution"
         )
     return manifold.system.problem(scene_key(row), message)
 
@@ -204,11 +205,11 @@ def _inconsistent_rates(manifold: Manifold, rows: Sequence[int], place: Configur
     row, others = constraints[rows[0]], _together_with(constraints, rows)
     if len(rows) > 1 and _alike(manifold, rows, place):
         names = _names(constraints, rows[1:])
-        message = f"contradicts {names}: no rates keep them zero. {NO_SINGLE_CHANGE}"
+        message = f"contradicts {names}: no velocities satisfy them. {NO_SOLUTION}"
     else:
         message = (
-            f"changes at the start{others}, and no rates mend it: the start is a singular "
-            "position. Start beside it, or correct a formula"
+            f"cannot be satisfied{others} by any initial velocities: the initial position is "
+            "singular. Choose one nearby, or correct a formula"
         )
     return manifold.system.problem(scene_key(row), message)
 
@@ -284,11 +285,11 @@ def gradient_problems(system: System, flat: Sequence[int]) -> Iterator[Problem]:
             and not base.is_Number
             and len(str(base)) < MAX_FORMULA_LENGTH
         )
-        alternative = f"{base} for {row.formula}" if simple else SEPARATE_TERMS
-        message = f"has no slope where it holds, and so no force: write {alternative}"
+        alternative = f"{base} in place of {row.formula}" if simple else SEPARATE_TERMS
+        message = f"has a zero gradient where it is satisfied, so no force: write {alternative}"
         yield system.problem(scene_key(row), message)
     if not flat:
-        message = f"have no slope where they hold, and so no force: write {SEPARATE_TERMS}"
+        message = f"have zero gradients where satisfied, so no force: write {SEPARATE_TERMS}"
         yield system.problem("constraints", message)
 
 
@@ -302,15 +303,15 @@ def massless_problem(manifold: Manifold, massless: Sequence[int], start: Configu
     if any(not nearby.singular for nearby in manifold.nearby(start.q, start.t, 1.0)):
         at = _values_text(manifold, massless, start.q)
         message = (
-            f"the rows lead to {at}, where the mass matrix is singular, though it is not nearby: "
-            "three angles of a spherical or free joint are singular at a pitch of pi/2. Turn the "
-            "body's own frame, or describe the rotation by a unit quaternion"
+            f"the constraints lead to {at}, where the mass matrix is singular, but not nearby: the "
+            "angles of a spherical or free joint are singular at a pitch of pi/2. Rotate the frame "
+            "of the body, or describe the rotation by a unit quaternion"
         )
         return system.problem(f"coordinates.{names[0]}", message)
     message = (
         f"{listed(names)} {'can move' if len(names) == 1 else 'can move together'} without moving "
-        "anything that has mass or inertia, and no row holds "
-        f"{'it' if len(names) == 1 else 'them'}: give what moves a mass, or add a row"
+        "mass or inertia, and no constraint determines "
+        f"{'it' if len(names) == 1 else 'them'}: add a mass that moves, or a constraint"
     )
     return system.problem(f"coordinates.{names[0]}", message)
 
@@ -323,13 +324,12 @@ def value_problems(manifold: Manifold, q: Vector) -> Iterator[Problem]:
     system, count = manifold.system, 0
     for k, c in enumerate(system.constraints):
         manifold_of_one = Manifold(replace(system, constraints=(c,)))
-        functions = ("constraints", "value"), ("constraint_jacobian", "slope")
+        functions = ("constraints", "value"), ("constraint_jacobian", "derivative")
         for name, quantity in functions:
             if not np.all(np.isfinite(manifold_of_one.value(name, q, 0 * q, 0.0))):
                 position = _values_text(manifold, np.flatnonzero(manifold.reads[k]), q)
                 message = (
-                    f"has no {quantity} at {position}: start where it has one, or guess closer "
-                    "to it"
+                    f"has no {quantity} at {position}: choose an initial state where it has one"
                 )
                 yield system.problem(scene_key(c), message)
                 count += 1
@@ -337,7 +337,7 @@ def value_problems(manifold: Manifold, q: Vector) -> Iterator[Problem]:
     if not count:
         position = _values_text(manifold, range(len(q)), q)
         yield system.problem(
-            "energy.kinetic", f"has no value at the start, {position}: start elsewhere"
+            "energy.kinetic", f"has no value at the initial state, {position}: choose another one"
         )
 
 

@@ -53,7 +53,7 @@ def checks(comparison: Comparison) -> Iterator[Check]:
             yield Check(
                 f"{'power of forces' if name == 'power' else name} of bodies",
                 partial(energy_error, name), tolerance=limit, states=comparison.few(8),
-                unit="of its size, from point masses",
+                unit="relative, from point masses",
             )  # fmt: skip
         if comparison.compiled:
             yield from frame_checks(comparison)
@@ -495,7 +495,7 @@ def frame_checks(comparison: Comparison) -> Iterator[Check]:
     for name, (error, limit) in functions.items():
         yield Check(
             name, error, tolerance=max(limit, UNITS * comparison.eps), states=comparison.few(4),
-            unit="of their size", portable=True,
+            unit="relative", portable=True,
         )  # fmt: skip
 
 

@@ -73,7 +73,7 @@ def check(
     finally:
         for model in models:
             model.integrator.ignores_events = False
-    kind = "Taylor arithmetic" if comparison.large else "equations written out"
+    kind = "Taylor arithmetic" if comparison.large else "expanded equations"
     counts = len(comparison.expected), comparison.sampler.rejected
     return CheckReport(system.name, results, *counts, kind)
 

@@ -65,7 +65,7 @@ class CheckResult:
 class Measurement:
     """A measured value, or the reason `why` nothing can be judged.
 
-    With a reason, the check passes; the value inf then means that there is nothing to test. unit,
+    With a reason, the check passes; the value inf then means that the check does not apply. unit,
     limit: replace those of the check if the value is of another quantity than the check's.
     """
 
@@ -236,7 +236,7 @@ class CheckReport:
 
     scene: name of the scene. states: number of states used. rejected: number of random states left
     out since their mass matrix D was not regular. reference: how the expected values were computed,
-    either "equations written out" (formulas) or "Taylor arithmetic" (numerical).
+    either "expanded equations" (formulas) or "Taylor arithmetic" (numerical).
     """
 
     scene: str
@@ -382,7 +382,7 @@ class Check:
             limit = m.limit
         if m.why:
             idle = math.isinf(error)
-            unit = ("nothing to test: " if idle else "not judged: ") + m.why
+            unit = ("not applicable: " if idle else "not judged: ") + m.why
             return CheckResult(self.name, error, limit, True, unit, judged=idle)
         passed = bool(error > limit if self.minimum and not m.unit else error <= limit)
         if not passed and self.excuse and not math.isnan(error):

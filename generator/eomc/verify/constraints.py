@@ -43,24 +43,26 @@ def checks(comparison: Comparison) -> Iterator[Check]:
     for name in VALUES:
         yield value_check(comparison, name, states)
     if comparison.dtype == np.float64:  # difference quotients need its digits
-        yield Check("A beside differences", jacobian_error, tolerance=SLOPE_LIMIT, unit="of A")
+        yield Check(
+            "A and finite differences", jacobian_error, tolerance=SLOPE_LIMIT, unit="relative to A"
+        )
         if system.run.needs_derivatives and not system.modes:
             yield Check(
                 "tangent", tangent_error, tolerance=SLOPE_LIMIT, states=comparison.few(2),
-                unit="of the rows' slopes",
+                unit="relative to A",
             )  # fmt: skip
     yield Check("power of multipliers", power_error)
     if system.reactions:
         yield Check(
             "reactions: virtual work", reaction_error, tolerance=max(WORK_TOLERANCE, 30 * eps),
-            states=comparison.few(4), unit="of its size",
+            states=comparison.few(4), unit="relative",
         )  # fmt: skip
     yield from projection_checks(comparison)
     for method in comparison.methods if comparison.compiled else ():
         yield Check(
             f"{method} on the constraints", partial(residual_along_run, method),
             tolerance=MAX_RESIDUAL, states=comparison.few(3), portable=True,
-            why="no step is taken, or all lead too far",
+            why="no step is possible, or all are too long",
         )  # fmt: skip
 
 
@@ -234,10 +236,10 @@ def projection_checks(comparison: Comparison) -> Iterator[Check]:
     # displacements from the constraints, relative to the scale of the states
     cases = [(e, part) for e in comparison.few(6) for part in (1e-6, 1e-3, 1e-2)]
     why = "no state that is moved away has a place nearby"
-    for name, with_fixed in (("project", False), ("project, held", True)):
+    for name, with_fixed in (("project", False), ("project, fixed values", True)):
         yield Check(
             name, partial(projection_error, with_fixed, np.random.default_rng(11)), states=cases,
-            portable=True, why="nothing can be held" if with_fixed else why,
+            portable=True, why="no value can be fixed" if with_fixed else why,
         )  # fmt: skip
 
 

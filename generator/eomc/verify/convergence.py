@@ -48,7 +48,7 @@ def checks(comparison: Comparison) -> Iterator[Check]:
     if comparison.dtype != np.float64:
         return
     runs = Convergence(comparison)
-    excuse = f" not to be expected with {comparison.corners}" if comparison.corners else ""
+    excuse = f" not expected with {comparison.corners}" if comparison.corners else ""
 
     def order_check(
         name: str, measure: Callable[[], Measurement], least: float, unit: str
@@ -60,8 +60,8 @@ def checks(comparison: Comparison) -> Iterator[Check]:
 
     for method in comparison.methods:
         measure = partial(runs.order, method)
-        yield order_check(f"order of {method}", measure, least_order(method), "order observed")
-    unit = "order at which it closes"
+        yield order_check(f"order of {method}", measure, least_order(method), "observed order")
+    unit = "observed order"
     yield order_check("power balance", runs.closing, runs.closing_limit, unit)
     yield from advice_checks(comparison, runs)
 
@@ -78,8 +78,8 @@ def advice_checks(comparison: Comparison, runs: Convergence) -> Iterator[Check]:
             yield Check(
                 f"h of {method}", lambda *_, m=method: advice.failing_fraction(m),
                 tolerance=PARTS[0], states=(None,), minimum=True,
-                unit="of the advised h, where runs are lost",
-                excuse=f"no matter with {corners}" if corners else "",
+                unit="of the recommended h: smallest with an unstable run",
+                excuse=f"not applicable with {corners}" if corners else "",
             )  # fmt: skip
 
 
@@ -424,19 +424,19 @@ class Advice:
         step sizes must agree; the motion then leaves the region where the advice holds.
         """
         if method == "euler" and self._velocities_matter():
-            return Measurement(math.inf, "for forces of positions alone")
+            return Measurement(math.inf, "the method is for forces that depend on positions alone")
         longest = self._longest_advised(method, self.stiffest_state, 1e3 * self.runs.duration)
         if math.isinf(longest):
-            return Measurement(math.inf, "no mode turns or decays")
+            return Measurement(math.inf, "no mode oscillates or decays")
         eigen = self._step_by_eigenvalues(method)
         ratio = max(longest / eigen, eigen / longest)
-        unit = "times the eigenvalues' h; runs leave where it holds"
+        unit = "ratio to the h of the eigenvalues; runs leave the position"
         near = Measurement(ratio, unit=unit, limit=2) if ratio <= 2 else None
         if near and longest > self.runs.duration:
             return near
         fine, grown = self._ends(method, longest, 1 / 64)
         if not math.isfinite(grown):
-            return Measurement(math.inf, "the motion does not go on")
+            return Measurement(math.inf, "the motion ends")
         failing = math.nan
         for part in PARTS:
             end, growth = self._ends(method, longest, part)

@@ -48,7 +48,7 @@ def checks(comparison: Comparison) -> Iterator[Check]:
     """Yield the checks of names, values and laws."""
     yield Check(
         "names, defaults, start", lambda of, _: _metadata_differences(of), tolerance=0,
-        states=(None,), unit="that differ", portable=True,
+        states=(None,), unit="differences", portable=True,
     )  # fmt: skip
     states = [*comparison.expected, *comparison.unusual_states]
     for name in (*VALUES, "acceleration"):
@@ -64,7 +64,7 @@ def checks(comparison: Comparison) -> Iterator[Check]:
     if comparison.dtype == np.float64:  # difference quotients need its digits
         # differences are exact to 1e-10; a wrong sign in C makes an error of 1
         yield Check(
-            "Ddot - 2C + dD/dt skew", _skewness_error, tolerance=1e-6, unit="of D's rate"
+            "Ddot - 2C + dD/dt skew", _skewness_error, tolerance=1e-6, unit="relative to dD/dt"
         )  # fmt: skip
 
 
@@ -697,7 +697,7 @@ def limit_checks(comparison: Comparison) -> Iterator[Check]:
     if any(x is not None for i in comparison.system.inputs for x in i.limits):
         yield Check(
             "limits of inputs", _differing_results, tolerance=0, states=comparison.few(4),
-            unit="that differ", portable=True,
+            unit="differences", portable=True,
         )  # fmt: skip
 
 

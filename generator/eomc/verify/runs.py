@@ -60,16 +60,16 @@ def checks(comparison: Comparison) -> Iterator[Check]:
         name = "one step" + f" of {method}" * (method != "rk4")
         yield Check(
             name, partial(_largest_step_error, method), states=few, portable=True,
-            why="no step from any state is finite",
+            why="no step is finite",
         )  # fmt: skip
     if comparison.compiled or comparison.methods[0] == "rk4":
         for method in comparison.methods:
             name = "run" + f" by {method}" * (method != "rk4")
             yield Check(
                 name, partial(largest_run_error, method), states=comparison.few(2), portable=True,
-                why="no step is finite, or all lead too far",
+                why="no step is finite, or all are too long",
             )  # fmt: skip
-    yield Check("run: its energy", _energy_error, states=comparison.few(2)[-1:])
+    yield Check("energy of the run", _energy_error, states=comparison.few(2)[-1:])
     if comparison.compiled:
         yield from adaptive_checks(comparison)
         yield from event_checks(comparison)
@@ -245,7 +245,7 @@ def adaptive_checks(comparison: Comparison) -> Iterator[Check]:
         yield Check(
             f"adaptive steps, {'stiff' if stiff else f'{tol:g}'}",
             partial(adaptive_error, max(tol, 8 * comparison.eps), stiff), tolerance=0.1,
-            states=comparison.few(3), unit="tolerances a step, times growth", portable=True,
+            states=comparison.few(3), unit="tolerances per step, times growth", portable=True,
             why="a difference grows too much in a few steps",
         )  # fmt: skip
 

@@ -89,7 +89,7 @@ class NewtonChecks:
         """
         place = self.place()
         if place is None or not place.fastest:
-            return Measurement(math.inf if place else math.nan, "no mode turns or decays")
+            return Measurement(math.inf if place else math.nan, "no mode oscillates or decays")
         # step sizes as multiples of the time scale of the fastest mode
         sweeps = [self.sweeps(method, place, x / place.fastest) for x in (1.5, 3.0, 6.0, 15.0)]
         known = [x for x in sweeps if x is not None]
