@@ -289,7 +289,7 @@ class Regressor:
         W = np.reshape(Y, (-1, len(self.names)))
         W = W[np.isfinite(W).all(axis=1)]
         sizes = np.linalg.norm(W, axis=0)
-        sizes[sizes < tolerance**2 * sizes.max()] = 0  # rounding errors
+        sizes[sizes < RANK_TOLERANCE**2 * sizes.max()] = 0  # rounding errors
         W = W * (sizes > 0)
         basis, columns = np.zeros((len(W), 0)), []
         for k, size in enumerate(sizes):
@@ -301,7 +301,7 @@ class Regressor:
                 columns.append(k)
         scaled = W / np.where(sizes > 0, sizes, 1)
         weights = np.linalg.lstsq(scaled[:, columns], scaled)[0]
-        weights[np.abs(weights) < tolerance] = 0
+        weights[np.abs(weights) < RANK_TOLERANCE] = 0
         matrix = weights * sizes / sizes[columns, None]
         matrix[:, columns] = np.eye(len(columns))
         return BaseParameters(self.names, tuple(columns), matrix, matrix @ self.parameters)
@@ -344,7 +344,7 @@ class BaseParameters:
 
     def __str__(self) -> str:
         lines = [f"{len(self.columns)} base parameters of {len(self.parameters)} parameters"]
-        lines += [f"  {x: .6g}  {n}" for n, x in zip(self.names, self.values, strict=True)]
+        lines += [f"{x:14.6g}  {n}" for n, x in zip(self.names, self.values, strict=True)]
         if self.without_effect:
             lines.append(f"  without effect: {texts.listed([*self.without_effect])}")
         return "\n".join(lines)

@@ -136,10 +136,12 @@ def test_base_parameters_of_a_planar_chain(folder: Path) -> None:
         regressor.base_parameters(np.zeros((2, 6)))
     # a column that depends on another one up to noise
     Y = np.random.default_rng(1).standard_normal((50, 2, 8))
-    Y[..., 5] = 2 * Y[..., 1] + 1e-3 * Y[..., 5]
+    Y[..., 5] = 2 * Y[..., 1] + 5e-3 * Y[..., 0] + 1e-3 * Y[..., 5]
+    Y[..., 6] *= 1e-5
     assert len(regressor.base_parameters(Y).columns) == 8
     base = regressor.base_parameters(Y, tolerance=1e-2)
     assert base.columns == (0, 1, 2, 3, 4, 6, 7)
+    assert abs(base.matrix[0, 5] - 5e-3) < 1e-3
     assert base.names[1] == f"link1.mx + {base.matrix[1, 5]:.6g}*link2.mx"
     assert abs(base.matrix[1, 5] - 2) < 1e-3
 
