@@ -108,7 +108,7 @@ static void eom_method_stage_derivatives(real *X, const real *J, int i, real h)
             const real by_q = J[W*k + l], by_qd = J[W*k + NQ + l];
 
             for (int w = 0; w < W; w++)
-                own[W*k + w] += by_q*SS[W*l + w] + by_qd*S[W*l + w];
+                own[W*k + w] = own[W*k + w] + by_q*SS[W*l + w] + by_qd*S[W*l + w];
         }
 }
 

@@ -276,6 +276,23 @@ def test_inputs_and_parameters_per_state(modules: Modules, period: float | None)
             getattr(m, name)(Q, QD, u=u)
 
 
+@pytest.mark.parametrize(
+    ("text", "method"), [(EXPLICIT, "rk4"), (EXPLICIT, "dp8"), (NYSTROM, "verlet")]
+)
+def test_steps_in_registers_equal_single_ones(modules: Modules, text: str, method: str) -> None:
+    """Of five states; an angle is beyond 2^20 rad, where sines in registers are wrong."""
+    m, random = modules.unoptimised(text), np.random.default_rng(2)
+    q, qd = random.uniform(-1, 1, (2, 5, 2))
+    q[2, 1] = 3e9
+    u, t, k = random.uniform(-1, 1, (5, m.nu)), np.linspace(0, 1, 5), np.linspace(3, 4, 5)
+    options: dict[str, Any] = {"h": 0.1, "method": method, "parameters": text is EXPLICIT}
+    many = m.discretize(q, qd, t=t, u=u, params={"k": k}, **options)
+    for j in range(5):
+        one = m.discretize(q[j], qd[j], t=t[j], u=u[j], params={"k": k[j]}, **options)
+        for a, b in zip(many, one, strict=True):
+            np.testing.assert_allclose(a[j], b, rtol=0, atol=8 * np.finfo(float).eps)
+
+
 @pytest.mark.parametrize("count", [None, 3])
 def test_matrices_are_written_into_out(modules: Modules, count: int | None) -> None:
     m = modules.unoptimised(EXPLICIT)

@@ -57,12 +57,13 @@ Slopes = Sequence[Mapping[Symbol, Expr]]  # ds_k/dq of each link, by coordinate
 class AccelerationDerivatives:
     """The derivatives [dqdd/dq, dqdd/dqd, dqdd/du] by rows, as atoms of the attribute `tape`.
 
-    pivots: those of the factorization of D, each with the diagonal entry that it is computed from.
-    order: indices of the coordinates in order of elimination.
+    accelerations: qdd itself. pivots: those of the factorization of D, each with the diagonal entry
+    that it is computed from. order: indices of the coordinates in order of elimination.
     """
 
     tape: Tape
     rows: Rows
+    accelerations: Sequence[Expr]
     pivots: Pairs
     order: tuple[int, ...]
 
@@ -131,7 +132,7 @@ def linearize(system: System, tree: Tree) -> AccelerationDerivatives:
 
     rows = tuple(zip(*map(column, (*q, *system.qd, *system.u)), strict=True))
     return AccelerationDerivatives(
-        tape, rows, factors.pivots, tuple(k for k, _, _ in factors.steps)
+        tape, rows, qdd, factors.pivots, tuple(k for k, _, _ in factors.steps)
     )
 
 

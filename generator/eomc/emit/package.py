@@ -135,6 +135,23 @@ class Binding:
         }
         return f.call(**(rows | passed))
 
+    def block_call(self, f: CFunction) -> str:
+        """Return the C call of a function of the scene for the states from index k on.
+
+        It takes the addresses of the results of these states and returns how many it computed.
+        """
+        NQ, columns = self.scene.NQ, self.scene.public.step_columns
+        sizes = {"A": f"2*{NQ}*2*{NQ}", "B": f"2*{NQ}*{self.scene.NU}", "q": NQ, "qd": NQ}
+        sizes |= {name: f"2*{NQ}*{count}" for name, count in columns.items()}
+        passed = {name: f"{name} + {size}*k" for name, size in sizes.items()}
+        own_t, own_u, own_p = (member("own", name) for name in "tup")
+        return f.call(
+            **passed, count="n - k",
+            t=f"{own_t} ? {own_t} + k : &t", t_instance=f"{own_t} != NULL",
+            u=f"u ? u + {own_u}*k : u", u_instance=own_u,
+            p=f"p + {own_p}*k", p_instance=own_p,
+        )  # fmt: skip
+
     def _parameters(self, place: str) -> str:
         """Return a C expression, an array of numbers, cast to the struct of parameters."""
         target = self.scene.target

@@ -256,7 +256,7 @@ class _Cases:
         if name != "linearization":
             return values
         return self.linearization_order(
-            [values[k : k + self.width] for k in range(0, len(values), self.width)]
+            [values[k : k + self.width] for k in range(0, self.nq * self.width, self.width)]
         )
 
     def linearization_order(self, rows: Sequence[Sequence[float]]) -> Vector:

@@ -339,6 +339,11 @@ class Mechanics:
         return bool(self.outputs or self.events or self.output_frames or self.run.inverse_dynamics)
 
     @property
+    def linearizes_stages(self) -> bool:
+        """Whether derivatives of steps need accelerations and their derivatives at each stage."""
+        return self.run.discretize and not self.constraints
+
+    @property
     def names(self) -> frozenset[str]:
         """The names that are in use, so that no definition or output may have them.
 

@@ -369,8 +369,8 @@ class Route:
         apply.
     linearization
         Function that returns the derivatives of the accelerations by q, qd and u, (nq, 2 nq + nu)
-        by rows, from the selected computation of the accelerations; None if the route does not
-        apply.
+        by rows, from the selected computation of the accelerations, and behind them the
+        accelerations if `System.linearizes_stages`; None if the route does not apply.
     solved
         Returns a sentence for a comment that says how D qdd = tau - bias is solved, from the system
         and the names of the coordinates in order of elimination.
@@ -497,6 +497,8 @@ def _forward(material: RouteInputs, taken: Candidate) -> Candidate:
     entries = [x for row in rows for x in row]
     columns = 2 * len(system.q) + len(system.u)
     calls = columns * len(system.q) // len(entries)
+    if calls == 1 and system.linearizes_stages:
+        entries += taken.outputs
     return Candidate(taken.tape, entries, taken.checks, calls=calls)
 
 
@@ -506,7 +508,9 @@ def _by_inverse_dynamics(material: RouteInputs, _: Candidate) -> Candidate | Non
     if tree is None or system.constraints or not applies(system, tree):
         return None
     derived = linearize(system, tree)
-    return Candidate(derived.tape, [x for row in derived.rows for x in row], derived.pivots)
+    entries = [x for row in derived.rows for x in row]
+    entries += derived.accelerations if system.linearizes_stages else ()
+    return Candidate(derived.tape, entries, derived.pivots)
 
 
 def _by_residuals(material: RouteInputs, _: Candidate) -> Candidate | None:

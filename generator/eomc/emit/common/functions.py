@@ -55,7 +55,10 @@ class Linearization:
     width
         Length of one row [da/dq, da/dqd, da/du], as a C expression.
     slopes
-        The static function that computes all rows.
+        The static function that computes all rows, and behind them the accelerations for the stages
+        of a step.
+    size
+        The number of its results, as a C expression with the enumerators NQ and WIDTH (`width`).
     function
         The public function, which splits the rows into A_q, A_qd and B.
     signal
@@ -64,6 +67,7 @@ class Linearization:
 
     width: str
     slopes: GeneratedFunction
+    size: str
     function: CFunction
     signal: CFunction | None
 
@@ -567,7 +571,9 @@ class SceneFunctions:
         )
         reads = self.arguments_read(function) | outputs
         public = replace(self.public.linearization, doc=(cost,), reads=reads)
-        return Linearization(width, slopes, public, self.signal if self.reads_u(function) else None)
+        size = "NQ*WIDTH + NQ" if target.system.linearizes_stages else "NQ*WIDTH"
+        signal = self.signal if self.reads_u(function) else None
+        return Linearization(width, slopes, size, public, signal)
 
 
 def portable_functions(

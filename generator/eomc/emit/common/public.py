@@ -15,6 +15,7 @@ from eomc.emit.common.c_function import (
     return_statement,
 )
 from eomc.emit.common.c_names import Target
+from eomc.integrators.tableaux import METHODS
 from eomc.program.ir import Function
 from eomc.program.program import TIME
 
@@ -348,17 +349,44 @@ class Public:
         target, s = self.target, self.target.system
         if "linearization" not in target.program or not s.run.needs_derivatives:
             return None
-        real, count = target.real.name, CArgument("long", "count")
-        out = (output_array(real, name) for name in ("A", *(["B"] if s.inputs else [])))
-        needed = {"t": target.driven, "u": bool(s.inputs), "p": target.needs_p}
-        own = [
+        return self._block("linearization_block", "A", *(["B"] if s.inputs else []))
+
+    def derivative_block(self, method: str) -> CFunction | None:
+        """Return the prototype of the C function that differentiates a step from several states.
+
+        It is that of `linearization_block`, for a step by an explicit method.
+        """
+        s, columns = self.target.system, self.step_columns
+        if not (s.linearizes_stages and self.linearization_block) or METHODS[method].implicit:
+            return None
+        return self._block(f"{method}_derivative_block", *columns, step=True)
+
+    @property
+    def load_states(self) -> CFunction:
+        """The prototype of the C function that loads states into the lanes of registers."""
+        function = self._block("load_states", "to")
+        states = CArgument(f"{self.target.prefix}_states *", "to")
+        arguments = (function.arguments[0], states, *function.arguments[2:])
+        return replace(function, arguments=arguments, qualifier="static")
+
+    def _block(self, name: str, *out: str, step: bool = False) -> CFunction:
+        """Return the prototype of a C function of several states, which returns their number.
+
+        out: names of the arrays for the results. step: whether it takes a step size.
+        """
+        target, real = self.target, self.target.real.name
+        needed = {"t": target.driven, "u": bool(target.system.inputs), "p": target.needs_p}
+        own = (
             argument
             for name in (name for name, is_needed in needed.items() if is_needed)
             for argument in (input_array(real, name), CArgument("long", f"{name}_instance"))
-        ]
-        state = (input_array(real, name) for name in STATE)
-        name = f"{target.prefix}_linearization_block"
-        return CFunction(name, "long", (count, *out, *state, *own))
+        )
+        arguments = (
+            CArgument("long", "count"), *(output_array(real, name) for name in out),
+            *(input_array(real, name) for name in STATE),
+            *([CArgument(real, "h")] if step else []), *own,
+        )  # fmt: skip
+        return CFunction(f"{target.prefix}_{name}", "long", arguments)
 
     @property
     def project(self) -> CFunction:

@@ -478,8 +478,6 @@ def _lanes(steppers: Steppers) -> Iterator[str]:
         yield _library(functions, wide)
     if steppers.steps_in_registers:
         yield show("c/optimised/lane.c", functions, steppers=steppers, lane=wide)
-    if functions.public.linearization_block:
-        yield show("c/optimised/linearization_block.c", functions, lane=wide)
     if functions.projection:
         yield "\n\n".join(one.projection_source(functions)) + "\n"
         if batch:
@@ -541,6 +539,8 @@ def _steppers(steppers: Steppers) -> Iterator[str]:
         method = adaptive.METHOD
         yield show("c/optimised/stages.c", functions, steppers=steppers, method=method)
     yield from _from_library(steppers, model)
+    if functions.public.linearization_block:
+        yield show("c/optimised/linearization_block.c", functions, lane=steppers.wide)
 
 
 def _from_library(steppers: Steppers, model: SolverModel) -> Iterator[str]:

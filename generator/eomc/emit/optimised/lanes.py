@@ -623,21 +623,31 @@ class Lane:
 
     @cached_property
     def linearization(self) -> GeneratedFunction:
-        """The C function for the rows of [da/dq, da/dqd], behind them those of da/du."""
-        function, n = self.target.program["linearization"], len(self.target.names)
-        m, width = len(self.target.input_names), 2 * n
-        places = [
-            f"r[{width * i + j if j < width else n * width + m * i + j - width}]"
-            for i in range(n)
-            for j in range(width + m)
-        ]
+        """The C function for the rows of [da/dq, da/dqd], then da/du, then a if steps need it."""
+        n, m = len(self.target.names), len(self.target.input_names)
+        rows = [range(k, k + 2 * n + m) for k in range(0, n * (2 * n + m), 2 * n + m)]
+        columns = (slice(2 * n), slice(2 * n, None))
+        order = [k for part in columns for row in rows for k in row[part]]
+        function = self.target.program["linearization"]
+        outputs = [function.outputs[k] for k in order] + [*function.outputs[len(order) :]]
+        doc = "The rows of [da/dq, da/dqd], those of da/du at constant inputs, and a where needed."
+        return self._derivatives("slopes", replace(function, outputs=tuple(outputs)), doc)
+
+    @cached_property
+    def sensitivity(self) -> GeneratedFunction:
+        """The C function for the derivatives of the accelerations with respect to parameters."""
+        function = self.target.program["sensitivity"]
+        return self._derivatives("sensitivity", function, "The rows of da/dp.")
+
+    def _derivatives(self, name: str, function: Function, doc: str) -> GeneratedFunction:
+        """Return the C function for derivatives, which reads parameters in lanes of their own."""
+        places = [f"r[{k}]" for k in range(len(function.outputs))]
         takes = [a for a in self.argument_names if a not in "sc"]
         parameters = frozenset(self.accelerations.parameter_names)
         p = c.input_array(self._parameters, "p")
         extra = [(p, parameters, c.member("p", "{}"))] if self.target.needs_p else ()
         out = c.output_array(self.real.name, "r")
-        signature = Signature("slopes", out, places, takes, {}, extra)
-        doc = "The rows of [da/dq, da/dqd], then those of da/du, at constant inputs."
+        signature = Signature(name, out, places, takes, {}, extra)
         return self.generate_function(function, signature, doc, inline=False)
 
     @cached_property
@@ -708,16 +718,16 @@ class Lane:
         """Sorted names of the mathematical functions in the scene's accelerations and signals.
 
         The projection onto the constraints and the linearization are included. Sine and cosine are
-        not, except of parameters in the linearization.
+        not, except of parameters in derivatives.
         """
-        others = map(self.target.program.functions.get, ("signal", "projection", "linearization"))
+        derivatives = ("linearization", "sensitivity")
+        others = map(self.target.program.functions.get, ("signal", "projection", *derivatives))
         functions = [self.accelerations.function, *filter(None, others)]
         assignments = [a for f in functions for a in (*f.early, *f.body)]
         names = {a.value.function for a in assignments if isinstance(a.value, Call)}
         names -= {"sin", "cos", "reciprocal"}
-        if functions[-1].name == "linearization":
-            calls = (a.value for a in functions[-1].early if isinstance(a.value, Call))
-            names |= {call.function for call in calls} & {"sin", "cos"}
+        early = [a for f in functions if f.name in derivatives for a in f.early]
+        names |= {a.value.function for a in early if isinstance(a.value, Call)} - {"reciprocal"}
         return tuple(sorted({"sign" if n == "heaviside" else n for n in names}))
 
     @property
