@@ -337,3 +337,15 @@ def test_docstrings_begin_with_what_they_describe() -> None:
         and (docstring := ast.get_docstring(node))
         and VAGUE_BEGINNING.match(docstring)
     ]
+
+
+TOP_LEVEL = set(
+    "pyproject.toml Makefile generator templates csrc build tests scenes benchmarks docs "
+    "README.md CHANGELOG.md CONTRIBUTING.md CITATION.cff LICENSE".split()
+)
+
+
+def test_the_top_level_holds_what_is_agreed_on_only() -> None:
+    """No file of a trial and no output of a test lies at the top level."""
+    names = {path.name for path in ROOT.iterdir() if not path.name.startswith(".")}
+    assert names <= TOP_LEVEL
