@@ -304,3 +304,25 @@ def test_check_detects_a_wrong_adjoint(
     module = eomc.load(system, tmp_path)
     report = check(system, module, states=4, tables=[equations.derivative_checks])
     assert [row.name for row in report.results if not row.passed] == ["adjoint by rk4"]
+
+
+@pytest.mark.parametrize("inputs", ["table", "constant", "signals"])
+def test_instances_of_batches_have_the_gradients_of_single_runs(
+    modules: Modules, inputs: str
+) -> None:
+    """Tables differ from instance to instance; constant inputs are the same for all."""
+    m = modules.unoptimised(RK4_LOOP + "batch = true\n")
+    random = np.random.default_rng(5)
+    q0, qd0 = random.standard_normal((2, 3, 2)) * 0.3
+    tables = {"table": random.standard_normal((3, 5, 2)), "constant": np.ones(2)}
+    u, steps = tables.get(inputs), {"h": 0.02, "steps": 20, "every": 3}
+    steps |= {"control_period": 0.08} if inputs == "table" else {}
+    batch = m.simulate_batch(q0, qd0, u=u, **steps)
+    gradient = batch.vjp(batch.q, batch.qd)
+    for k in range(3):
+        own = u[k] if inputs == "table" else u
+        run = m.simulate(q0[k], qd0[k], u=own, **steps)
+        for one, of_batch in zip(run.vjp(run.q, run.qd), gradient, strict=True):
+            np.testing.assert_allclose(of_batch[k], one, rtol=1e-9, atol=1e-12)
+    with pytest.raises(ValueError, match=r"q_bar: shape \(2, 2\), expected \(3, 8, 2\)"):
+        batch.vjp(np.ones((2, 2)))

@@ -310,6 +310,40 @@ def test_sensitivities_of_an_adaptive_run_pass_through_events(modules: Modules) 
     np.testing.assert_allclose(height, 2 * run.q[:, 1:] * exact.start[:, 1], rtol=0, atol=1e-13)
 
 
+BATCH = RUN.replace('["rk4", "dp8", "gauss8", "gauss16"]', '"rk4"\nbatch = true').replace(
+    "tolerance = 1e-12\n", ""
+)
+
+
+@pytest.mark.parametrize("duration", [0.9, 0.1])
+def test_instances_of_batches_have_the_derivatives_of_single_runs(
+    modules: Modules, duration: float
+) -> None:
+    """The first instance stops at the net, the second one does not reach it."""
+    m = modules.unoptimised(TABLE_TENNIS.replace(RUN, BATCH).replace("swung", "swung_batch"))
+    qd0 = np.array([[2.0, 0.5], [0.5, 0.4]])
+    steps = {"h": 0.05, "duration": duration, "params": {"e": np.array([0.8, 0.7])}}
+    batch = m.simulate_batch(np.array([[0.0, 0.8]] * 2), qd0, **steps)
+    draw = np.random.default_rng(3).standard_normal
+    q_bar, apex = draw(batch.q.shape), batch.events["apex"]
+    t_bar, state_bar = draw(apex.t.shape), draw(apex.q.shape)
+    gradient = batch.vjp(q_bar, events={"apex": (t_bar, None, state_bar)})
+    sensitivity = batch.sensitivity()
+    for k, e in enumerate((0.8, 0.7)):
+        times = batch.t
+        run = m.simulate([0.0, 0.8], qd0[k], h=0.05, times=times, params={"e": e})
+        own = apex.instance == k
+        one = run.vjp(q_bar[k, : len(run)], events={"apex": (t_bar[own], None, state_bar[own])})
+        n = len(one.u)
+        for a, b in zip(one, (x[k] for x in gradient), strict=True):
+            np.testing.assert_allclose(b[:n] if a is one.u else b, a, rtol=1e-9, atol=1e-12)
+        assert not gradient.u[k, n:].any()
+        start = run.sensitivity().start
+        np.testing.assert_allclose(sensitivity.start[k, : len(run)], start, rtol=1e-9, atol=1e-12)
+        assert np.isnan(sensitivity.start[k, len(run) :]).all()
+    assert (len(run) == len(batch.t)) and (batch.stopped[0] == "net") == (duration > 0.5)
+
+
 OUTPUTS = '[outputs]\nheight = "y**2"\n[[event]]'
 LOB = f"""eomc = 1
 name = "lob"

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .arguments import Array
 from .atomic_write import File
@@ -17,7 +18,10 @@ from .interfaces import CompiledBatchModel
 from .package import require_eomc
 from .requests import Request, count_steps, split_times
 from .status import FULL, STATUS
-from .trajectory import failure_message
+from .trajectory import Trajectory, failure_message
+
+if TYPE_CHECKING:
+    from .sensitivity import RunGradient, Sensitivity
 
 _STATUSES = np.array([*STATUS, FULL])
 _SINGLE_RUN_ATTRIBUTES = {
@@ -196,6 +200,60 @@ class BatchTrajectory(Columns):
         """Return the status number of each instance that failed at its initial state, else 0."""
         failed = (self.steps == 0) & (self.status_codes < STATUS.index("interrupted"))
         return np.where(failed, self.status_codes, 0)
+
+    def simulate_instance(self, k: int) -> Trajectory:
+        """Simulate instance k as a single run with the same rows, as far as it gets."""
+        request = self.request
+        q, qd, p = (x[min(k, len(x) - 1)] for x in (request.q, request.qd, request.p))
+        u = None if request.u is None else request.u[min(k, len(request.u) - 1)]
+        if u is None or len(u) == 1:  # no table
+            request = request.replace(period=0.0, periods=0)
+            u = u if u is None else u[0]
+        times = request.times if request.has_equal_steps else self.t
+        request = request.replace(q=q, qd=qd, p=p, u=u, times=times, max_evaluations=0)
+        run: Trajectory = self.model.integrator.integrate(request)
+        return run
+
+    def vjp(
+        self, q_bar: ArrayLike | None = None, qd_bar: ArrayLike | None = None, *,
+        events: Mapping[str, tuple[ArrayLike | None, ...]] | None = None,
+    ) -> RunGradient:  # fmt: skip
+        """Return the gradient of a scalar function of the rows of each instance.
+
+        See `Trajectory.vjp`. Each instance is simulated once more, as a single run.
+
+        Parameters
+        ----------
+        q_bar, qd_bar : (batch, n, nq) array_like or None
+            Derivatives of the functions with respect to the positions and velocities; None: zeros.
+        events : mapping, optional
+            Derivatives with respect to `self.events[name]`: a tuple (t_bar, q_bar, qd_bar) by the
+            name of each event.
+
+        Returns
+        -------
+        RunGradient
+            The gradient of each instance, with a leading axis (batch,), also where the instances
+            share inputs or parameters.
+
+        Raises
+        ------
+        MotionError, ValueError, KeyError
+            As `Trajectory.vjp`.
+        """
+        from .sensitivity import pull_back_batch
+
+        return pull_back_batch(self, q_bar, qd_bar, events)
+
+    def sensitivity(self, **options: Any) -> Sensitivity:
+        """Return the forward sensitivities of each instance, with a leading axis (batch,).
+
+        See `Trajectory.sensitivity`, also for the arguments. Each instance is simulated once more,
+        as a single run. The derivatives at rows that an instance does not reach are nan.
+        """
+        from .sensitivity import batch_sensitivity
+
+        return batch_sensitivity(self, **options)
 
     def select(self, numbers: Sequence[int]) -> BatchTrajectory:
         """Return a batch of the instances with these numbers (indices)."""

@@ -12,7 +12,7 @@ it starts at the event time. Together these are the saltation matrix of the step
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from math import inf, isqrt
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
@@ -189,6 +189,37 @@ def pull_back(
     if status:
         _refuse(STATUS[status], run.q[0], run.qd[0])
     return RunGradient(q0_bar, qd0_bar, u_bar if u is None else u_bar.reshape(u.shape), p_bar)
+
+
+def pull_back_batch(
+    batch: Any, q_bar: ArrayLike | None, qd_bar: ArrayLike | None, events: Mapping[str, Any] | None
+) -> RunGradient:
+    """Return the gradients of functions of the rows of each instance; see `BatchTrajectory.vjp`."""
+    bars = [_seeds(x, of, batch.q) for x, of in ((q_bar, "q_bar"), (qd_bar, "qd_bar"))]
+    results = []
+    for k in range(len(batch)):
+        run, own = batch.simulate_instance(k), {}
+        for name, parts in (events or {}).items():
+            at = batch.events[name].instance == k
+            own[name] = tuple(x if x is None else np.asarray(x)[at] for x in parts)
+        results.append(run.vjp(*(x[k, : len(run)] for x in bars), events=own))
+    return RunGradient(*(_stack(x, 0.0) for x in zip(*results, strict=True)))
+
+
+def batch_sensitivity(batch: Any, **options: Any) -> Sensitivity:
+    """Return the derivatives of the rows of each instance; see `BatchTrajectory.sensitivity`."""
+    runs = map(batch.simulate_instance, range(len(batch)))
+    results = [run.sensitivity(**options) for run in runs]
+    return Sensitivity(*(_stack(x, np.nan) for x in zip(*results, strict=True)))
+
+
+def _stack(arrays: Sequence[Array], value: float) -> Array:
+    """Return arrays with different numbers of rows as one array, with a value in missing rows."""
+    shape = len(arrays), max(len(x) for x in arrays), *arrays[0].shape[1:]
+    result = np.full(shape, value, arrays[0].dtype)
+    for row, x in zip(result, arrays, strict=True):
+        row[: len(x)] = x
+    return result
 
 
 def _refuse(status: str, q: Array, qd: Array) -> NoReturn:
