@@ -97,6 +97,18 @@ static real eom_roughness(const eom_gauss_stages *a, const real *scale, const re
 }
 
 /*
+ * The admissible size of a step of that roughness, relative to its size: the size whose roughness is sqrt(tol/2), because
+ * the error of the end of a step is the square of that of the polynomial (as Rein & Spiegel, MNRAS 446 (2015), 1424).
+ */
+static real eom_size_factor(real rough, real tol)
+{
+    static const real LEAST_ERROR = (real)1e-8; /* avoids a division by zero */
+    const real aim = eom_sqrt(tol/2);
+
+    return rough > LEAST_ERROR*aim ? eom_sqrt(eom_sqrt(eom_sqrt(aim/rough))) : eom_max_factor;
+}
+
+/*
  * s->h = the size of the first step, from the time scale of the motion. s->span = the remaining time, at most
  * EOM_LONGEST time scales of the motion, so that a distant t_end does not matter.
  */
@@ -110,6 +122,7 @@ static void eom_initial_step_size(eom_run_state *s, const real *a, real t_end)
     static const real RANGE = 100; /* coordinates below that part of the largest count as that part */
     static const real FIRST_SIZE = (real)0.05, LONGEST = EOM_LONGEST; /* size and span in time scales of the motion */
     static const real MANY_TIME_SCALES = 50, LEAST_STEPS = 1000; /* if the span has fewer: that many steps */
+    static const real LEAST_SIZE = 256*EOM_EPS; /* relative to t: where all coordinates are zero within rounding, they are no scale */
     const real *const q = s->q, *const qd = s->qd;
     real far = 0, fast = 0, most = 0;
 
@@ -130,6 +143,7 @@ static void eom_initial_step_size(eom_run_state *s, const real *a, real t_end)
     }
     s->span = most*(t_end - s->t) > LONGEST ? LONGEST/most : t_end - s->t;
     s->h = most*s->span > MANY_TIME_SCALES ? FIRST_SIZE/most : s->span/LEAST_STEPS;
+    s->h = s->h > LEAST_SIZE*eom_fabs(s->t) ? s->h : LEAST_SIZE*eom_fabs(s->t);
 }
 
 /* The size below which a step is not reduced. */
