@@ -43,7 +43,7 @@ static real eom_greater(real a, real b)
     return a > b ? a : b;
 }
 
-/* The rounding error of event function k: its largest change by perturbations of a state. */
+/* The rounding error of event function k: its largest change if the state varies by rounding. */
 static real eom_event_rounding(int k, const real *q, const real *qd, real t, const eom_model *m)
 {
     static const real PERTURBATION = 4*EOM_EPS; /* relative */
@@ -89,7 +89,7 @@ static real eom_evaluate_event(int k, real z, const eom_run_state *s, const eom_
  * The sign that event function k has after the start of the step: its own sign there if it is not zero. Otherwise that of
  * its first value above rounding errors at the fractions 5e-7*4^n, since a function that leaves zero may return before the
  * first node; or that at the end of the step. 0, and e->is_driven: a jump left it at zero without a rate, and the
- * acceleration drives it through zero again: a z + b z^2, of which 16 z, 4 z and z give b alone, is b z^2.
+ * acceleration drives it on: it is a z + b z^2, as g(16 z) - 20 g(4 z) + 64 g(z) vanishes, and b z^2 prevails.
  */
 static int eom_leaving_sign(int k, eom_event_samples *e, const eom_run_state *s, const eom_model *m)
 #else
@@ -189,13 +189,14 @@ static int eom_sample_events(eom_event_samples *samples, eom_run_state *s, const
 #if EOM_SEVERAL
 /*
  * The first fraction after samples->from at which event function k, which has this sign there, crosses zero; 2: there is
- * none. Of one that is driven: samples->from. An interval whose ends have this sign, where the function first approaches
- * zero, may have one before the extremum.
+ * none. Of one that is driven: samples->from. If the function approaches zero and recedes in an interval at whose ends it
+ * has this sign, the crossing may be before its extremum.
  */
 #else
 /*
  * The first fraction after samples->from at which event function k, which has this sign there, crosses zero; 2: there is
- * none. An interval whose ends have this sign, where the function first approaches zero, may have one before the extremum.
+ * none. If the function approaches zero and recedes in an interval at whose ends it has this sign, the crossing may be
+ * before its extremum.
  */
 #endif
 #if EOM_INITIAL_EVENTS
@@ -385,12 +386,13 @@ static void eom_move_root(eom_root *x, real z, const eom_run_state *s, const eom
 #endif
 #if EOM_JUMPS
 /*
- * Whether to accept the root x although a residual is left: values more than 64 times as large follow it, and either
- * such values precede it (x->hidden: none do), or the last jump is recent, at most 4 times the distance to the step's start.
+ * Whether the function crosses zero at x, although it is not small there (a discontinuity, or rounding): values over 64
+ * times as large follow, and precede it (x->hidden: none do), or the last jump is at most 4 times as far back as the start.
  */
 #else
 /*
- * Whether to accept the root x although a residual is left: values more than 64 times as large precede and follow.
+ * Whether the function crosses zero at x, although it is not small there (a discontinuity, or rounding errors): values
+ * more than 64 times the residual precede and follow.
  */
 #endif
 static int eom_accept_root(eom_root *x, real residual, const eom_run_state *s, const eom_event_samples *samples)
@@ -413,14 +415,14 @@ static int eom_accept_root(eom_root *x, real residual, const eom_run_state *s, c
 
 #if EOM_ADAPTIVE
 /*
- * Refine a root on states by shorter steps, which are as accurate as steps, and along the interpolant where the state of
- * an adaptive step moves little: by the secant method, and by bisection where it fails, since slopes are rounding errors
- * or the interpolant deviates. Returns whether there is a root.
+ * Refine a root with states by shorter steps of the method, which are more accurate than the interpolant, and along the
+ * interpolant where the state of an adaptive step moves little: by the secant method, and by bisection if that fails.
+ * Returns whether there is a root.
  */
 #else
 /*
- * Refine a root on states by shorter steps, which are as accurate as steps: by the secant method, and by bisection where
- * it fails, since slopes are rounding errors or the interpolant deviates. Returns whether there is a root.
+ * Refine a root with states by shorter steps of the method, which are more accurate than the interpolant: by the secant
+ * method, and by bisection if that fails. Returns whether there is a root.
  */
 #endif
 static int eom_refine_root(eom_root *x, const eom_event_samples *samples, const eom_run_state *s, const eom_model *m, eom_output *output)

@@ -39,7 +39,8 @@ static real eom_next_grid_time(eom_run_state *s, real t_end, real h)
 /*
  * Store the interpolant of a step of size h from s->q, s->qd to q, qd, of degree five (Hermite). It matches positions,
  * velocities and accelerations (before, after) at both ends. Accelerations: even + odd x + second (x^2 - 1)
- * + cubic (x^3 - x), x = 2 z - 1; cubic = 0 if it is rounding. mean, weighted_mean: of them, and of 1 - z times them.
+ * + cubic (x^3 - x), x = 2 z - 1; cubic = 0 if it is rounding. mean, weighted_mean: means over 0 <= z <= 1 of the
+ * accelerations, and of 1 - z times them.
  */
 static void eom_fit_interpolant(eom_run_state *s, const real *q, const real *qd, const real *before, const real *after, real h)
 {

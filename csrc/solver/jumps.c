@@ -74,9 +74,9 @@ static eom_status eom_apply_jump(real *q, real *qd, int k, real t, const eom_mod
 }
 
 /*
- * Update the intervals between jumps of event x->k. Returns whether they accumulate (Zeno behaviour): the intervals that
- * follow T and T', whose sum is T'^2/(T - T'), are rounding (not if the ratio is below 1e-6); or the next height, ratio^2
- * times this one, is; or no significant value precedes the root (x->hidden); or many jumps coincide.
+ * Update the intervals between jumps of event x->k. Returns whether they accumulate (Zeno behaviour): the intervals after T
+ * and T', whose sum is T'^2/(T - T'), are below rounding errors (if T'/T is above 1e-6); or the next height, ratio^2 times
+ * this one, is; or no significant value precedes the root (x->hidden); or many jumps coincide.
  */
 static int eom_update_accumulation(eom_run_state *s, const eom_root *x, const eom_model *m, eom_output *output)
 {

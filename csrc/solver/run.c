@@ -1,6 +1,6 @@
 /* Runs: the loop over steps, the stored rows, and the continuation of a run in the next call. */
 
-/* Store a state and its time in the next row, if rows follow each step. */
+/* Store a state and its time in the next row, unless the times of rows are given. */
 static void eom_store_step(eom_output *output, const eom_options *options, real t, const real *q, const real *qd)
 {
     if (options->times || output->rows >= options->rows)
@@ -43,7 +43,7 @@ static void eom_store_times(eom_output *output, const eom_options *options, cons
     }
 }
 
-/* Begin a run at q, qd, or continue that in memory if it has exactly this state: returns 1. */
+/* Begin a run at q, qd, or continue that in memory if it has this state exactly (returns 1). */
 static int eom_begin_run(eom_run_state *s, const real *q, const real *qd, const eom_options *options, const eom_model *m, eom_output *output)
 {
     const real t = output->has_started ? output->t : options->t0;
@@ -70,7 +70,11 @@ static int eom_begin_run(eom_run_state *s, const real *q, const real *qd, const 
 #endif
         for (int k = 0; k < EOM_NE; k++) {
             s->event[k].jump_time = t;
+#if EOM_TWO_SIDED
+            s->event[k].contact = has_jumped ? output->contact[k] : 0;
+#else
             s->event[k].contact = has_jumped ? -eom_direction[k] : 0;
+#endif
         }
 #endif
 #endif
@@ -144,22 +148,14 @@ static eom_status eom_step_with_events(eom_run_state *s, const eom_options *opti
 }
 
 #endif
-/* From q, qd to options->t_end, in place, by options->steps steps at most. */
+/* Integrate q, qd in place to options->t_end, by options->steps steps at most. */
 static eom_status eom_run(real *q, real *qd, const eom_options *options, const eom_model *m, eom_output *output)
 {
     enum { FITS = 1/(sizeof(eom_run_state) <= sizeof output->memory->data) }; /* else an error */
     eom_run_state s;
     const int continues = eom_begin_run(&s, q, qd, options, m, output);
-#if EOM_EVENTS
-#if EOM_ADAPTIVE
-    const int is_valid = options->h >= 0 && eom_finite(&s.t, 1) && options->t_end == options->t_end;
-#else
-    const int is_valid = options->h > 0 && eom_finite(&s.t, 1) && options->t_end == options->t_end;
-#endif
-#else
-    const int is_valid = eom_finite(&s.t, 1) && options->t_end == options->t_end;
-#endif
-    eom_status status = is_valid ? EOM_OK : EOM_NOT_FINITE;
+    const int is_finite = eom_finite(&s.t, 1) && options->t_end == options->t_end;
+    eom_status status = is_finite ? EOM_OK : EOM_NOT_FINITE;
 #if EOM_INITIAL_EVENTS
     const int applies = !continues || eom_have_events_changed(&s, s.last_values, m);
 #endif
@@ -199,6 +195,10 @@ static eom_status eom_run(real *q, real *qd, const eom_options *options, const e
     }
     eom_copy_state(q, qd, s.q, s.qd);
     output->t = s.t;
+#if EOM_TWO_SIDED
+    for (int k = 0; k < EOM_NE; k++)
+        output->contact[k] = s.event[k].contact;
+#endif
 #if EOM_EVENTS
     eom_event_functions(s.last_values, s.q, s.qd, s.t, m);
 #endif

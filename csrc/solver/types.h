@@ -19,7 +19,7 @@ typedef enum { EOM_CONVERGED, EOM_NOT_CONVERGED, EOM_UNDEFINED } eom_outcome;
 typedef struct {
     int sign; /* of the event function; 0: unknown */
 #if EOM_JUMPS
-    int contact; /* its sign before the last jump; 0: none, or the jump has switched a mode */
+    int contact; /* its sign before the last jump; 0: no jump yet, or it has switched a mode */
 #endif
     real offset; /* zero level: value at the last root, until it is left; 0: none */
 #if EOM_RECORDS
@@ -74,7 +74,7 @@ typedef struct {
 #if EOM_SEVERAL
     real jumped; /* time of the last jump of any event */
 #endif
-    int simultaneous_jumps; /* number of further jumps at the same time */
+    int simultaneous_jumps; /* number of further jumps at the time of the last one */
 #endif
 #if EOM_ADAPTIVE
     real part_size; /* size of the last part of a step that resolves the event functions; 0: they are resolved in whole steps */

@@ -35,6 +35,7 @@ batch = true
 PROGRAM = """#define _GNU_SOURCE /* feenableexcept */
 #include "ball.h"
 #include <fenv.h>
+#include <math.h>
 #include <stdio.h>
 
 static void print(const char *what, int status, int holds)
@@ -42,7 +43,7 @@ static void print(const char *what, int status, int holds)
     printf("%s %d %d\\n", what, status, holds);
 }
 
-/* A run in calls of `steps` steps without memory, which go on after one is not OK. */
+/* A run in calls of `steps` steps without memory; fixed steps go on after one is not OK. */
 static void bounce(const char *what, double e, long steps)
 {
     ball_params p = ball_defaults;
@@ -58,8 +59,10 @@ static void bounce(const char *what, double e, long steps)
         status = (int)ball_integrate(q, qd, &p, &options, &output);
         is_above &= q[0] > -1e-9;
     }
-    end = output.t;
-    for (int n = 0; n < 3; n++)
+    end = sqrt(2/p.g)*(1 + e)/(1 - e);
+    is_above &= fabs(output.limit/end - 1) < 1e-7 && fabs(output.t/end - 1) < 1e-7;
+    last = status;
+    for (int n = 0; n < 3 && options.h > 0; n++)
         last = (int)ball_integrate(q, qd, &p, &options, &output);
     print(what, status, last == status && is_above && q[0] > -1e-9 && output.t - end < 1e-6);
 }
@@ -80,6 +83,17 @@ static void rise(void)
     print("rising", status, output.t > -1.6 && q[0] < -0.9);
 }
 
+/* Whether a run by steps of size h makes no step, and has status 6. */
+static int is_refused(double h)
+{
+    double q[1] = { 1.0 }, qd[1] = { 0.0 };
+    ball_options options = { .t_end = 1.0, .h = h, .steps = 1000 };
+    ball_output output = { 0 };
+    const int status = (int)ball_integrate(q, qd, &ball_defaults, &options, &output);
+
+    return status == 6 && output.steps == 0 && q[0] == 1.0 && qd[0] == 0.0;
+}
+
 int main(void)
 {
     double q[1] = { 1.0 }, qd[1] = { 0.0 }, rows[4], row[3];
@@ -98,9 +112,11 @@ int main(void)
     options.times = 0;
     output.which = which;
     output.event_rows = row;
-    output.room = 1;
+    output.room = BALL_NE_ROOM - 1;
     status = (int)ball_integrate(q, qd, &ball_defaults, &options, &output);
     print("room", status, output.steps == 0);
+    print("size", is_refused(-0.01), is_refused(NAN));
+    print("none", is_refused(0.0), 1); /* adaptive steps if there are any */
     output.room = 0;
     output.which = 0;
     options.ignores_events = 1;
@@ -122,13 +138,18 @@ int main(void)
 
 
 @pytest.mark.parametrize("folder", [".", "fast"])
-@pytest.mark.parametrize("steps", tiers(["fixed", "of both kinds", "adaptive"], "of both kinds"))
+@pytest.mark.parametrize(
+    "steps",
+    tiers(["fixed", "fixed, both directions", "of both kinds", "adaptive"], "of both kinds"),
+)
 def test_calls_have_a_status_that_says_what_happened(
     folder: str, steps: str, tmp_path: Path
 ) -> None:
     """Status 6: the options are invalid; 4: jumps accumulate, also in calls without memory."""
-    tolerance = "" if steps == "fixed" else "tolerance = 1e-9\n"
-    files = eomc.sources(from_scene(parse(BALL + tolerance, "ball.toml"))).files
+    is_fixed = steps.startswith("fixed")
+    text = BALL + ("" if is_fixed else "tolerance = 1e-9\n")
+    text = text.replace("falling", "both") if "directions" in steps else text
+    files = eomc.sources(from_scene(parse(text, "ball.toml"))).files
     for name, text in files.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text, encoding="utf-8")
@@ -137,12 +158,11 @@ def test_calls_have_a_status_that_says_what_happened(
     sources = ("calls.c", f"{folder}/ball.c", f"-I{folder}", "-lm", "-o", "calls")
     compiled(needs("gcc"), *STRICT, "-O1", *sources, cwd=tmp_path)
     lines = run("./calls", cwd=tmp_path).stdout.splitlines()
-    if steps == "adaptive":  # only a single call ends at the contact
-        assert [line[:-2] for line in (lines[4], lines[6])] == ["whole 4", "plastic 4"]
-        return
+    refused = ["early 6 1", "batch 6 1", "room 6 1", "size 1 1"]
+    refused.append("none 1 1" if is_fixed else "none 0 1")
     accumulated = ["whole 4 1", "steps 4 1", "plastic 4 1", "steps 4 1", "nearly 4 1"]
     accumulated.append("rising 0 1")
-    assert lines == ["early 6 1", "batch 6 1", "room 6 1", "time 0 1", *accumulated]
+    assert lines == [*refused, "time 0 1", *accumulated]
 
 
 def test_header_states_direction_and_action_of_an_event() -> None:

@@ -46,13 +46,21 @@ def test_compilers_issue_no_warnings(which: str, name: str, tmp_path: Path) -> N
             compiled(*call, *how, file, cwd=tmp_path)
 
 
+def rich_files(name: str) -> dict[str, str]:
+    """Return the C of a scene with adaptive steps or events."""
+    if name == "stick":
+        text = STICK
+    else:
+        options, tables = RICH[name]
+        text = (SCENES / f"{name}.toml").read_text(encoding="utf-8")
+        text = text.replace("[run]\n", "[run]\n" + options) + tables
+    return dict(eomc.sources(system.from_scene(scene.parse(text, f"{name}.toml"))).files)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RICH)
 def test_adaptive_steps_and_events_compile_without_warnings(name: str, tmp_path: Path) -> None:
-    options, tables = RICH[name]
-    text = (SCENES / f"{name}.toml").read_text(encoding="utf-8")
-    text = text.replace("[run]\n", "[run]\n" + options) + tables
-    files = eomc.sources(system.from_scene(scene.parse(text, f"{name}.toml"))).files
+    files = rich_files(name)
     for file in (f"{name}.c", f"{name}.h"):
         (tmp_path / file).write_text(files[file], encoding="utf-8")
     for call, standard, language in (
@@ -62,6 +70,38 @@ def test_adaptive_steps_and_events_compile_without_warnings(name: str, tmp_path:
     ):
         how = [f"-std={standard}", *STRICT[1:], "-O1", "-I.", "-c", *language]
         compiled(*call, *how, f"{name}.c", cwd=tmp_path)
+
+
+STICK = """eomc = 1
+name = "stick"
+[coordinates]
+x = { start = 1.0, friction = 1 }
+[energy]
+kinetic = "x_dot**2/2"
+potential = "5*x**2"
+[run]
+friction = "stick"
+tolerance = 1e-9
+"""
+TRAPS = """#define _GNU_SOURCE
+#include <fenv.h>
+static __attribute__((constructor)) void enable(void)
+{
+    feenableexcept(FE_DIVBYZERO | FE_INVALID | FE_OVERFLOW);
+}
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("folder", [".", "fast"])
+@pytest.mark.parametrize("name", ["stick", *RICH])
+def test_runs_raise_no_floating_point_exceptions(name: str, folder: str, tmp_path: Path) -> None:
+    for file, content in {**rich_files(name), "traps.c": TRAPS}.items():
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        (tmp_path / file).write_text(content, encoding="utf-8")
+    sources = ("main.c", "traps.c", f"{folder}/{name}.c", f"-I{folder}", "-lm", "-o", "main")
+    compiled(needs("gcc"), "-std=gnu99", "-O1", *sources, cwd=tmp_path)
+    assert run("./main", cwd=tmp_path).returncode == 0
 
 
 @pytest.mark.slow

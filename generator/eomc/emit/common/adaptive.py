@@ -141,6 +141,7 @@ def features(functions: SceneFunctions) -> dict[str, bool]:
         "EVENTS": bool(system.events),
         "SEVERAL": len(system.events) > 1,
         "JUMPS": "jumps" in program,
+        "TWO_SIDED": functions.target.has_two_sided_jumps,
         "SWITCHES": any(switches(functions.target)),
         "ONLY_JUMPS": all(e.action == "jump" for e in system.events),
         # Events that are ignored where their functions are zero in a whole step, within rounding

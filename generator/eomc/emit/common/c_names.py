@@ -295,6 +295,11 @@ class Target:
         return self.is_adaptive or bool(self.system.events)
 
     @property
+    def has_two_sided_jumps(self) -> bool:
+        """Whether the state jumps at events of both directions."""
+        return any(e.action == "jump" and e.direction == "both" for e in self.system.events)
+
+    @property
     def max_events_per_step(self) -> int:
         """Number of events in one step at which the step is ended early."""
         return EVENTS_PER_STEP + sum(e.begins is not None for e in self.system.events)
