@@ -92,13 +92,13 @@ def shortest(calls: dict[str, Callable[[], Any]], rounds: int) -> dict[str, floa
 def difference_error(m: Any, q: Any, qd: Any, u: Any, width: float = 4e-3) -> float:
     """Return the largest relative difference of A, B from differences of the accelerations."""
     errors, n = [], m.nq
-    for state in zip(q[:5], qd[:5], u[:5], strict=True):
+    matrices = m.linearize(q[:5], qd[:5], u=u[:5] if m.nu else None)
+    for *state, A, B in zip(q[:5], qd[:5], u[:5], *matrices, strict=True):
         x = np.concatenate(state)
 
         def qdd(x: Any) -> Any:
             return m.acceleration(x[:n], x[n : 2 * n], u=x[2 * n :] if m.nu else None)
 
-        A, B = m.linearize(x[:n], x[n : 2 * n], u=x[2 * n :] if m.nu else None)
         exact = np.hstack([A[n:], B[n:]])
         near = [
             sum(w * (qdd(x + k * e) - qdd(x - k * e)) for k, w in STENCIL) / width

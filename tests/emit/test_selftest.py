@@ -139,7 +139,7 @@ FAULTS = {
     "the frequency of a signal": ("signal", r"sin\(", "sin(1.1*"),
     "a limit": ("applied", r"fmin\(3\.0", "fmin(2.9"),
     "a jump": ("jumps", r"after\[2\] = ([^;]*);", r"after[2] = 0.9*(\1);"),
-    "a linearization": ("slopes", r"slopes\[2\] = -\(0\.2", "slopes[2] = -(0.3"),
+    "a linearization": ("slopes", r"slopes\[2\] = -", "slopes[2] = -1.5*"),
 }
 TABLES = {
     "a coefficient of dp8": (r"0\.0197250569", "0.0198250569"),

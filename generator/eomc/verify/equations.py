@@ -308,7 +308,8 @@ def module_derivatives(of: Comparison, name: str, s: State) -> Vector | None:
             return np.hstack(of.module.acceleration_vjp(q, qd, np.eye(n), **arguments))
         columns = np.split(np.eye(count), np.cumsum(sizes)[:-1], axis=1)
         return np.asarray(of.module.acceleration_jvp(q, qd, columns, **arguments)).T
-    A, B = of.module.linearize(s.q, s.qd, **arguments)
+    several = (np.stack([x, x]) for x in (s.q, s.qd))  # which optimised C computes in registers
+    A, B = (x[1] for x in of.module.linearize(*several, **arguments))
     if not np.array_equal(A[:n], np.eye(n, 2 * n, n)) or np.any(B[:n]):
         return None
     return np.hstack([A[n:], B[n:]])
