@@ -194,8 +194,8 @@ class PreciseEvents(PreciseRun):
                 x = self.end(i, time)
             self.path.append((time, x))
         rows = []
-        for place, at in zip(of.places, of.points, strict=True):
-            time, x = self.path[place]
+        for k, place in enumerate(of.places):
+            (time, x), at = self.path[place], of.point(k)
             if place < 0 and at.event >= 0:
                 time, x = self.event(at.event, at.row, at.time)
             elif place < 0:

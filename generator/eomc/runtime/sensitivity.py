@@ -346,8 +346,8 @@ class _Steps:
     places : (m,) array of int
         Rows of the m results: the rows of the run, then the occurrences of events. -1 for a result
         between two rows.
-    points : list of _Point
-        The results.
+    results : tuple of arrays
+        The results: the rows, times, states and events of `_Point`.
     """
 
     def __init__(self, run: Any, name: str) -> None:
@@ -368,7 +368,7 @@ class _Steps:
         times, x = np.append(run.t, occurrences[:, 0]), np.vstack([run.x, occurrences[:, 1:]])
         events, places = np.append(np.full(len(run), -1), which), np.searchsorted(self.t, times)
         before = np.maximum(places - 1, 0)
-        self.points = [_Point(*point) for point in zip(before, times, x, events, strict=True)]
+        self.results = before, times, x, events
         places[self.t[np.minimum(places, len(self.t) - 1)] != times] = -1
         if has_all_rows:
             places[: len(run)] = np.arange(len(run))
@@ -377,10 +377,15 @@ class _Steps:
             places[-1] = len(self.t) - 1
         self.places = places
         self.ends = {
-            row: _Point(row - 1, *self.points[k][1:])
+            row: _Point(row - 1, *self.point(k)[1:])
             for k, row in enumerate(places.tolist())
             if row > 0 and k >= len(run)
         }
+
+    def point(self, k: int) -> _Point:
+        """Return the k-th result."""
+        row, time, x, event = (values[k] for values in self.results)
+        return _Point(int(row), float(time), x, int(event))
 
     def _jump_row(self, occurrence: Array) -> int:
         """Return the row before the state jump at an occurrence [t; q; qd]; -1: there is none."""
@@ -504,8 +509,8 @@ class _Steps:
 
         is_row = self.places >= 0
         np.add.at(bars, self.places[is_row], seeds[is_row])
-        for k in np.flatnonzero(~is_row & seeds.any(axis=1)):
-            at = self.points[k]
+        for k in np.flatnonzero(~is_row & seeds.any(axis=1)).tolist():
+            at = self.point(k)
             part = self.pull_back_step(at, fix_size(at, seeds[k]))
             add(at.row, part)
             bars[at.row] += np.append(part.t[0], part.x)
@@ -582,8 +587,8 @@ class _Steps:
                 S[last + 1, 1:] = jump.x @ S[last, 1:] + jump.t * S[last, 0]
                 S[last + 1, 1:, size:] += np.concatenate([jump.u, jump.p], axis=1)
         results = S[self.places]
-        for k in np.flatnonzero(self.places < 0):
-            at = self.points[k]
+        for k in np.flatnonzero(self.places < 0).tolist():
+            at = self.point(k)
             rows = np.array([self.t[at.row], at.time]), np.stack([self.x[at.row], at.x])
             results[k] = self.propagate(at.row, *rows, S[at.row])[1]
             if at.event >= 0:
