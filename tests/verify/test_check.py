@@ -236,7 +236,7 @@ def test_order_is_not_judged_across_discontinuities(monkeypatch: pytest.MonkeyPa
     """The table and the JSON report say so, and the check passes; without a discontinuity it
     fails.
     """
-    x, v, low = symbol("x"), symbol("x_dot"), lambda *_: Measurement(1.0)
+    x, v, low = symbol("x"), symbol("x_dot"), lambda *_: 1.0
     monkeypatch.setattr(Convergence, "order", low)
     monkeypatch.setattr(convergence, "advice_checks", lambda *_: ())
     for force, passed in ((sympy.sign(v), True), (sympy.tanh(v), False)):
@@ -393,18 +393,18 @@ def test_derivatives_are_compared_with_finite_differences(
 
 
 @pytest.mark.parametrize("name", tiers(("cartpole", "mass_spring"), "mass_spring"))
-def test_advice_on_h_is_compared_with_runs(modules: Modules, name: str) -> None:
-    """The advice must be right within a factor of eight below and of two above."""
+def test_advice_on_h_is_compared_with_eigenvalues(modules: Modules, name: str) -> None:
+    """The advice must be right within a factor of two."""
     system = scene_system(name)
-    for by, good in ((1.0, True), (1 / 16, False), (16.0, False)):
+    for by, good in ((1.0, True), (1 / 2.2, False), (2.2, False)):
         comparison = Comparison(
             system, ModuleWithScaledAdvice(modules(name), by), np.random.default_rng(0), 4
         )
-        (row,) = comparison.report(lambda of: advice_checks(of, Convergence(of)))
+        (row,) = comparison.report(advice_checks)
         assert row.name == "h of rk4" and row.passed == good, row
-        assert not good or row.error in (0.25, 0.5, 1, 2)
+        assert not good or row.error < 1.1
 
 
 def test_without_oscillation_there_is_no_advice_to_check() -> None:
     (row,) = (r for r in report_of_mass_spring().results if r.name == "h of rk4")
-    assert row.passed and math.isinf(row.error) and row.unit.startswith("not applicable")
+    assert row.passed and row.unit == "not applicable: nothing limits h"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 from types import ModuleType
 
@@ -17,7 +16,6 @@ from eomc.model.system import System, from_scene
 from eomc.scene.read import parse
 from eomc.verify.comparison import Comparison
 from eomc.verify.constraints import MAX_RESIDUAL, residual_along_run
-from eomc.verify.convergence import Advice, Convergence
 
 CRANK = """
 [[body]]
@@ -78,16 +76,6 @@ def system(*parameters: object) -> System:
 def comparison(modules: Modules, *parameters: object, seed: int = 0) -> Comparison:
     module: ModuleType = modules.unoptimised(parallelogram(*parameters))
     return Comparison(system(*parameters), module, np.random.default_rng(seed), None)
-
-
-@pytest.mark.slow
-def test_advised_step_is_tried_from_consistent_states(modules: Modules) -> None:
-    """Near the singular position no state near a start moved by 1e-6 satisfies the constraints."""
-    advice = Advice(Convergence(comparison(modules, *TURNS)))
-    x, v = -5e-6, -3.6
-    advice.stiffest_state = replace(advice.start, q=np.array([x, x, 0]), qd=np.array([v, v, 0]))
-    _, grown = advice._ends("rk4", 0.001, 1)
-    assert grown < 10
 
 
 @pytest.mark.slow

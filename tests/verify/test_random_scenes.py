@@ -23,7 +23,6 @@ from eomc.model.system import from_scene
 from eomc.scene.read import parse
 from eomc.verify import equations
 from eomc.verify.comparison import CheckReport, Comparison, Measurement
-from eomc.verify.convergence import Advice, Convergence
 from eomc.verify.equations import module_derivatives
 from eomc.verify.sampling import State
 
@@ -448,9 +447,6 @@ def test_unstable_steps_do_not_determine_the_scale_of_the_motion(modules: Module
     assert comparison.simulate(comparison.sampler.start).status == "not finite"
     assert np.allclose(comparison.sampler.spread, [0.5, 0.3], rtol=0.1)
     assert np.allclose(comparison.sampler.speed, [84, 3], rtol=0.1)
-    advice = Advice(Convergence(comparison))
-    stiff = advice.stiffest_state
-    assert np.all(np.abs([stiff.q, stiff.qd]) < 101 * advice.scale)
     report = report_of(LEAVING, modules)
     (row,) = (r for r in report.results if r.name == "h of gauss16")
     assert row.judged and report.passed, report.table()

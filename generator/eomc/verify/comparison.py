@@ -63,16 +63,13 @@ class CheckResult:
 
 @dataclass(frozen=True)
 class Measurement:
-    """A measured value, or the reason `why` nothing can be judged.
+    """A measured value that is not judged, and the reason `why`.
 
-    With a reason, the check passes; the value inf then means that the check does not apply. unit,
-    limit: replace those of the check if the value is of another quantity than the check's.
+    The check passes; the value inf means that the check does not apply.
     """
 
     value: float
-    why: str = ""
-    unit: str = ""
-    limit: float = math.inf
+    why: str
 
 
 def units(values: Any, expected: Any, scale: Any) -> float:
@@ -358,13 +355,13 @@ class Check:
 
     def _measure(self, of: Comparison) -> float | Measurement:
         """Return the largest error over the states, or the least value."""
-        errors: list[float | None] = []
+        errors, reason = list[float](), Measurement(math.nan, self.why)
         for state in of.expected if self.states is None else self.states:
             ours = self.ours(of, state)
-            if ours is None:
-                continue
             if isinstance(ours, Measurement):
-                return ours
+                reason = ours
+            if ours is None or isinstance(ours, Measurement):
+                continue
             expected = (
                 np.zeros(np.shape(ours)) if self.reference is None else self.reference(of, state)
             )
@@ -372,20 +369,17 @@ class Check:
             errors.append(float(ours) if self.minimum else units(ours, expected, scale))
         if self.minimum and errors:
             return float(np.min(np.array(errors, float)))
-        return largest(errors, self.why)
+        return float(np.max(errors)) if errors else reason
 
     def _judge(self, measured: float | Measurement) -> CheckResult:
         """Return the result for a measured error."""
-        m = measured if isinstance(measured, Measurement) else Measurement(measured)
-        error, limit, unit = m.value, self.tolerance, m.unit or self.unit
-        if m.unit:
-            limit = m.limit
-        if m.why:
-            idle = math.isinf(error)
-            unit = ("not applicable: " if idle else "not judged: ") + m.why
-            return CheckResult(self.name, error, limit, True, unit, judged=idle)
-        passed = bool(error > limit if self.minimum and not m.unit else error <= limit)
-        if not passed and self.excuse and not math.isnan(error):
+        limit, unit = self.tolerance, self.unit
+        if isinstance(measured, Measurement):
+            idle = math.isinf(measured.value)
+            unit = ("not applicable: " if idle else "not judged: ") + measured.why
+            return CheckResult(self.name, measured.value, limit, True, unit, judged=idle)
+        passed = bool(measured > limit if self.minimum else measured <= limit)
+        if not passed and self.excuse and not math.isnan(measured):
             unit = f"not judged: {self.excuse}"
-            return CheckResult(self.name, error, limit, True, unit, judged=False)
-        return CheckResult(self.name, error, limit, passed, unit)
+            return CheckResult(self.name, measured, limit, True, unit, judged=False)
+        return CheckResult(self.name, measured, limit, passed, unit)

@@ -10,9 +10,8 @@ wherever a measurement is possible:
   motion.
 - A power balance closes at the order of the method and of Simpson's rule, or down to rounding. A
   wrong power leaves a residual that no halving changes.
-- A step size that the module advises is compared with runs. If runs leave the state that the advice
-  is for, as with stiff friction near rest, it is compared with the eigenvalues of the linearised
-  motion, from differences of the accelerations.
+- A step size that the module advises is compared with the eigenvalues of the linearised motion,
+  from differences of the accelerations. Stability limits of methods are tested with their tableaux.
 """
 
 from __future__ import annotations
@@ -20,9 +19,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from itertools import pairwise
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -31,7 +30,7 @@ from eomc.runtime import rank
 from eomc.verify import reference
 from eomc.verify.comparison import Check, Comparison, Measurement
 from eomc.verify.reference import Vector, differences
-from eomc.verify.sampling import EPS, MAX_DISTANCE, NUDGE, Expected, State, states_of_run
+from eomc.verify.sampling import EPS, Expected, State, states_of_run
 
 NOISE_FACTOR = 30.0  # differences above this multiple of rounding errors are due to the method
 ORDER_TOLERANCE = 0.3  # orders that differ by less are the same
@@ -51,7 +50,7 @@ def checks(comparison: Comparison) -> Iterator[Check]:
     excuse = f" not expected with {comparison.corners}" if comparison.corners else ""
 
     def order_check(
-        name: str, measure: Callable[[], Measurement], least: float, unit: str
+        name: str, measure: Callable[[], float | Measurement], least: float, unit: str
     ) -> Check:
         return Check(
             name, lambda *_: measure(), tolerance=least, states=(None,), unit=unit, minimum=True,
@@ -63,22 +62,22 @@ def checks(comparison: Comparison) -> Iterator[Check]:
         yield order_check(f"order of {method}", measure, least_order(method), "observed order")
     unit = "observed order"
     yield order_check("power balance", runs.closing, runs.closing_limit, unit)
-    yield from advice_checks(comparison, runs)
+    yield from advice_checks(comparison)
 
 
-def advice_checks(comparison: Comparison, runs: Convergence) -> Iterator[Check]:
+def advice_checks(comparison: Comparison) -> Iterator[Check]:
     """Yield the checks of the step sizes h that the module advises, for each method.
 
-    They pass if runs with an eighth of the advised h are stable and runs with twice that h are
-    unstable.
+    They are compared with the step sizes that follow from the eigenvalues of the linearised motion.
+    Under constraints only the initial state counts: far from it, what is linearised differs.
     """
-    advice, corners = Advice(runs), comparison.corners
+    corners = comparison.corners
+    states = comparison.expected[:1] if comparison.system.constraints else comparison.few(4)
     for method in comparison.methods:
         if math.isfinite(min(METHODS[method].limits)):
             yield Check(
-                f"h of {method}", lambda *_, m=method: advice.failing_fraction(m),
-                tolerance=PARTS[0], states=(None,), minimum=True,
-                unit="of the recommended h: smallest with an unstable run",
+                f"h of {method}", partial(step_size_ratio, method), tolerance=2,
+                states=states, unit="times the h of the eigenvalues",
                 excuse=f"not applicable with {corners}" if corners else "",
             )  # fmt: skip
 
@@ -208,7 +207,7 @@ class Convergence:
 
     # --- orders -----------------------------------------------------------------------------------
 
-    def order(self, method: str) -> Measurement:
+    def order(self, method: str) -> float | Measurement:
         """Return the observed order of convergence of `method`: the best over the initial states.
 
         The value is inf if all differences are rounding errors, and nan, with a reason, if the
@@ -307,7 +306,7 @@ class Convergence:
         """Least accepted order of the power balance: half the order of the method, at most 2."""
         return min(METHODS[self._best_method].order, 4) / 2
 
-    def closing(self) -> Measurement:
+    def closing(self) -> float | Measurement:
         """Return the order in h at which the error of the power balance vanishes.
 
         The error is jacobi(T) - jacobi(0) - ∫ power dt over a run; jacobi is the Jacobi energy
@@ -376,198 +375,109 @@ class Convergence:
 
 def _pick_order(
     values: Iterable[float], pick: Callable[[Iterable[float]], float], why: str
-) -> Measurement:
+) -> float | Measurement:
     """Return the order that `pick` selects from several places; inf if all are exact."""
     known = [x for x in values if not math.isnan(x)]
     orders = [x for x in known if math.isfinite(x)]
     if orders:
-        return Measurement(pick(orders))
+        return pick(orders)
     exact = "every run is exact up to rounding"
     return Measurement(math.inf, exact) if known else Measurement(math.nan, why)
 
 
 # --- advised step sizes ---------------------------------------------------------------------------
 
-# Step sizes of the runs with which an advised h is compared, as multiples of that h. The advice is
-# for the motion linearised at one state, and the motion leaves that state.
-PARTS = (1 / 8, 1 / 4, 1 / 2, 1, 2)
-UNSTABLE_GROWTH = 1e3  # growth of a difference, relative to that with fine steps: unstable
-MAX_END_ERROR = 0.1  # relative to the motion: a run with longer steps than advised is wrong
-# change of the initial state, relative to the motion; so small that it grows linearly with stiff
-# forces too
-SMALL_PERTURBATION = 1e-9
+DIFFERENCE_WIDTH = 3e-7  # of differences, relative to the scale: stiff forces are linear there
 
 
-class Advice:
-    """Checks of the step sizes h that a compiled module advises, by runs with other step sizes.
+def step_size_ratio(method: str, of: Comparison, e: Expected) -> float | Measurement:
+    """Return the advised h over that of the linearised motion, or the inverse if it is larger.
 
-    runs: the runs of the module with several step sizes.
+    The advised h is the longest without a warning of the module at the state of `e`. Both are at
+    most a thousand times the duration of the scene. There is nothing to compare without a warning,
+    and for Euler's method if accelerations depend on velocities.
     """
+    s, most = e.state, 1e3 * of.system.run.duration
+    at_rest = replace(s, qd=0 * s.qd)
+    own, other = (of.module_value("acceleration", x) for x in (s, at_rest))
+    if method == "euler" and not np.array_equal(own, other):
+        return Measurement(math.inf, "the method is for forces that depend on positions alone")
+    advised = _longest_advised(of.module, method, s, most)
+    if advised == most:
+        return Measurement(math.inf, "nothing limits h")
+    stable = min(most, _longest_stable(of, method, s))
+    return max(advised / stable, stable / advised)
 
-    def __init__(self, runs: Convergence) -> None:
-        self.of, self.runs = runs.of, runs
-        self.start, self.scale = self.of.expected[0].state, runs.scale
-        self.holonomic = np.array([c.holonomic for c in self.of.system.constraints], bool)
 
-    def failing_fraction(self, method: str) -> Measurement:
-        """Return the least multiple of the advised h, one of PARTS, with which a run is unstable.
+def _longest_advised(module: Any, method: str, s: State, most: float) -> float:
+    """Return the longest h without a warning of the module, to 5 %, or `most`."""
 
-        The runs start at `stiffest_state`. A run is unstable in three cases: it stops early; a
-        small difference of the initial state grows UNSTABLE_GROWTH times as much as with fine
-        steps; or its steps are longer than advised and its final state is wrong by MAX_END_ERROR of
-        the motion. The value is nan if no run is unstable, and inf, with a reason, if there is
-        nothing to test.
+    def is_advised(h: float) -> bool:
+        how = {"u": s.u, "params": s.params, "method": method, "t0": s.t}
+        return module.advice(s.q, s.qd, h, **how) is None
 
-        In two cases the result is another quantity with its own limit: the ratio of the advised h
-        to the h that follows from the eigenvalues of the linearised motion. They are: the runs
-        contradict the advice, or the advised h is longer than the motion. In both cases the two
-        step sizes must agree; the motion then leaves the region where the advice holds.
-        """
-        if method == "euler" and self._velocities_matter():
-            return Measurement(math.inf, "the method is for forces that depend on positions alone")
-        longest = self._longest_advised(method, self.stiffest_state, 1e3 * self.runs.duration)
-        if math.isinf(longest):
-            return Measurement(math.inf, "no mode oscillates or decays")
-        eigen = self._step_by_eigenvalues(method)
-        ratio = max(longest / eigen, eigen / longest)
-        unit = "ratio to the h of the eigenvalues; runs leave the position"
-        near = Measurement(ratio, unit=unit, limit=2) if ratio <= 2 else None
-        if near and longest > self.runs.duration:
-            return near
-        fine, grown = self._ends(method, longest, 1 / 64)
-        if not math.isfinite(grown):
-            return Measurement(math.inf, "the motion ends")
-        failing = math.nan
-        for part in PARTS:
-            end, growth = self._ends(method, longest, part)
-            wrong = part > 1 and not float(np.max(np.abs(end - fine))) <= MAX_END_ERROR
-            if wrong or not growth <= UNSTABLE_GROWTH * max(1.0, grown):
-                failing = part
-                break
-        return near if near and not failing > PARTS[0] else Measurement(failing)
+    low = most
+    while not is_advised(low):
+        low /= 2
+    high = min(most, 2 * low)
+    while high > 1.05 * low:
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if is_advised(middle) else (low, middle)
+    return low
 
-    @cached_property
-    def stiffest_state(self) -> State:
-        """State near the start of the motion for which the module advises the shortest h.
 
-        Only states within MAX_DISTANCE times the scale of the initial state count: if steps are too
-        long for the motion, later states are as large as 1e40 and differences have no digits left.
-        """
-        start = self.start
-        method = next(m for m in self.of.methods if math.isfinite(min(METHODS[m].limits)))
-        steps = min(2000, math.ceil(self.runs.duration / self.runs.h))
-        every = max(1, steps * max(1, len(start.q) // 8) // 256)  # at most 256 states
-        stiffest, longest = start, 1e3 * self.runs.duration
-        run = self.of.simulate(start, method, steps=steps, every=every)
-        for s in states_of_run(run, start):
-            if not np.all(np.abs([s.q - start.q, s.qd - start.qd]) < MAX_DISTANCE * self.scale):
-                break
-            if (here := self._longest_advised(method, s, longest)) < longest:
-                stiffest, longest = s, here
-        return stiffest
+def _longest_stable(of: Comparison, method: str, s: State) -> float:
+    """Return the longest stable h, s, of the motion linearised at a state, by differences.
 
-    def _longest_advised(self, method: str, s: State, most: float) -> float:
-        """Return the longest h without a warning of the module, to 5 %; inf if `most` has none."""
-        low = most
-        while self._warns(method, s, low):
-            low /= 2
-        if low == most:
-            return math.inf
-        high = 2 * low
-        while high > 1.05 * low:
-            middle = math.sqrt(low * high)
-            low, high = (low, middle) if self._warns(method, s, middle) else (middle, high)
-        return high
+    Under constraints the longer of two steps counts: along the constraints, since each step is
+    corrected onto them, though they turn with the motion; and along all directions.
+    """
+    candidates = [_constrained_directions(of, s)]
+    if of.system.constraints:
+        candidates.append(np.eye(2 * len(s.q)))
+    return max(_eigenvalue_limit(of, method, s, directions) for directions in candidates)
 
-    def _velocities_matter(self) -> bool:
-        """True if accelerations depend on velocities."""
-        s = self.runs.places[-1].state
-        at_rest = replace(s, qd=0 * s.qd)
-        one, other = (self.of.module_value("acceleration", x) for x in (s, at_rest))
-        return not np.array_equal(one, other)
 
-    def _warns(self, method: str, s: State, h: float) -> bool:
-        """True if the module advises against h at a state."""
-        message = self.of.module.advice(s.q, s.qd, h, params=s.params, method=method, t0=s.t)
-        return message is not None
+def _eigenvalue_limit(of: Comparison, method: str, s: State, directions: Vector) -> float:
+    """Return the longest stable h, s, for changes of [q; q̇] in the span of `directions`."""
+    x, scale = np.array([s.q, s.qd]), of.sampler.scale
 
-    def _ends(self, method: str, longest: float, part: float) -> tuple[Vector, float]:
-        """Return the scaled final state of a run over 8 times `longest` seconds, and the growth.
+    def rates(rows: Vector) -> list[Vector]:
+        states = x + (rows @ directions.T).reshape(-1, *x.shape) * scale
+        return [
+            np.array([qd, of.module_value("acceleration", replace(s, q=q, qd=qd))]) / scale
+            for q, qd in states
+        ]
 
-        The growth is the larger of that of a small difference of the initial state and of a tiny
-        one, for which stiff forces, which are soon at their bounds, are linear.
-        """
-        s = self.stiffest_state
-        signs = np.random.default_rng(1).choice([-1.0, 1.0], self.scale.shape)
-        # near singular positions, a state off the constraints may have no projection
-        directions = self._constrained_directions(s)
-        signs = (directions @ (directions.T @ signs.ravel())).reshape(signs.shape)
-        steps, ends = round(8 / part), []
-        for by in (0.0, NUDGE, SMALL_PERTURBATION):
-            q, qd = np.array([s.q, s.qd]) + by * signs * self.scale
-            how = {"h": part * longest, "steps": steps, "every": steps, "t0": s.t}
-            run = self.of.simulate(replace(s, q=q, qd=qd), method, **how)
-            if str(run.status) != "ok":
-                return np.full(self.scale.shape, math.inf), math.inf
-            ends.append(np.array([run.q[-1], run.qd[-1]]) / self.scale)
-        growths = (
-            np.max(np.abs(ends[k] - ends[0])) / by
-            for k, by in ((1, NUDGE), (2, SMALL_PERTURBATION))
-        )
-        return ends[0], float(max(growths))
+    zeros = np.zeros(directions.shape[1])
+    try:
+        slopes = differences(rates, zeros, zeros + DIFFERENCE_WIDTH)
+    except ArithmeticError:  # off the constraints there may be none
+        return 0.0
+    values = np.linalg.eigvals(directions.T @ slopes)
+    turning, decay = METHODS[method].limits
+    fastest = max(np.max(np.abs(values.imag)) / turning, np.max(-values.real) / decay)
+    return 1 / float(fastest) if fastest > 0 else math.inf
 
-    def _step_by_eigenvalues(self, method: str) -> float:
-        """Return the longest stable h, s, of the motion linearised at `stiffest_state`.
 
-        The derivatives are differences. Under constraints the longer of two steps counts: along the
-        constraints, since each step is corrected onto them, though they turn with the motion; and
-        along all directions.
-        """
-        candidates = [self._constrained_directions(self.stiffest_state)]
-        if self.holonomic.size:
-            candidates.append(np.eye(2 * len(self.stiffest_state.q)))
-        return max(self._eigenvalue_limit(method, directions) for directions in candidates)
+def _constrained_directions(of: Comparison, s: State) -> Vector:
+    """Return directions of [q; q̇] tangent to the constraints in units of the scale, (2 nq, k).
 
-    def _eigenvalue_limit(self, method: str, directions: Vector) -> float:
-        """Return the longest stable h, s, for changes of [q; q̇] in the span of `directions`."""
-        s = self.stiffest_state
-        x, step = np.array([s.q, s.qd]), SMALL_PERTURBATION**0.5 * 1e-2
+    The columns are orthonormal. Velocities change with positions so that rates of constraints
+    stay zero.
+    """
+    n, (far, fast) = len(s.q), of.sampler.scale
+    if not of.system.constraints:
+        return np.eye(2 * n)
+    A = of.module_value("constraint_jacobian", s)
+    holonomic = [c.holonomic for c in of.system.constraints]
+    of_q, of_qd = rank.null_space(A[holonomic] * far), rank.null_space(A * fast)
 
-        def rates(rows: Vector) -> list[Vector]:
-            states = x + (rows @ directions.T).reshape(-1, *x.shape) * self.scale
-            return [
-                np.array([qd, self.of.module_value("acceleration", replace(s, q=q, qd=qd))])
-                / self.scale
-                for q, qd in states
-            ]
+    def rates(rows: Vector) -> list[Vector]:
+        states = s.q + (rows @ of_q.T) * far
+        return [of.module_value("constraint_rates", replace(s, q=q)) for q in states]
 
-        try:
-            slopes = differences(rates, zeros := np.zeros(len(directions.T)), zeros + step)
-        except ArithmeticError:  # off the constraints there may be none
-            return 0.0
-        values = np.linalg.eigvals(directions.T @ slopes)
-        turning, decay = METHODS[method].limits
-        rate = np.max(np.abs(values.imag)) / turning, np.max(-values.real) / decay
-        fastest = float(max(rate))
-        return 1 / fastest if fastest > 0 else math.inf
-
-    def _constrained_directions(self, s: State) -> Vector:
-        """Return directions of [q; q̇] tangent to the constraints in units of the scale, (2 nq, k).
-
-        The columns are orthonormal. Velocities change with positions so that rates of constraints
-        stay zero.
-        """
-        n, (far, fast) = len(s.q), self.scale
-        if not self.holonomic.size:
-            return np.eye(2 * n)
-        A = self.of.module_value("constraint_jacobian", s)
-        of_q, of_qd = rank.null_space(A[self.holonomic] * far), rank.null_space(A * fast)
-
-        def rates(rows: Vector) -> list[Vector]:
-            states = s.q + (rows @ of_q.T) * far
-            return [self.of.module_value("constraint_rates", replace(s, q=q)) for q in states]
-
-        slopes = differences(rates, zeros := np.zeros(len(of_q.T)), zeros + 1e-5)
-        follow = -np.linalg.pinv(A * fast, rcond=rank.tolerance()) @ slopes
-        whole = np.block([[of_q, np.zeros((n, of_qd.shape[1]))], [follow, of_qd]])
-        return np.asarray(np.linalg.qr(whole)[0])
+    slopes = differences(rates, zeros := np.zeros(len(of_q.T)), zeros + 1e-5)
+    follow = -np.linalg.pinv(A * fast, rcond=rank.tolerance()) @ slopes
+    whole = np.block([[of_q, np.zeros((n, of_qd.shape[1]))], [follow, of_qd]])
+    return np.asarray(np.linalg.qr(whole)[0])
