@@ -20,7 +20,7 @@ from eomc.report.equations_text import write_equations
 from eomc.runtime.package import model_of
 from eomc.scene.read import parse
 from eomc.verify.check import check
-from eomc.verify.reference import DiscreteReference
+from eomc.verify.reference import MATRICES, VECTORS
 from eomc.verify.symbolic import reference_for
 from eomc.verify.taylor import TaylorReference
 
@@ -280,24 +280,31 @@ def test_both_references_treat_discrete_values_as_constants(text: str) -> None:
     system = assembled(from_scene(parse(text, "test.toml")))
     n = len(system.q)
     q, qd = np.random.default_rng(2).uniform(0.3, 0.9, (2, 5, n))
-    expected_reference, discrete_reference = (
-        reference_for(system),
-        DiscreteReference(system, TaylorReference(with_constant_parameters(system))),
-    )
+    moving = np.array([c.name not in system.discrete for c in system.coordinates])
+    params = {c.name: x for c, x in zip(system.coordinates, q.T, strict=True)}
+    core = TaylorReference(with_constant_parameters(system))
+    at_core = q[:, moving], qd[:, moving], 0.0, None, {n: params[n] for n in system.discrete}
     names = ["D", "C", "g", "bias", "tau", "kinetic", "potential", "energy", "power"]
     names += ["constraint_jacobian", "gamma"] if system.constraints else []
-    for name in names:
-        result, expected = (
-            x.evaluate(name, q, qd) for x in (discrete_reference, expected_reference)
-        )
-        np.testing.assert_allclose(result, expected, rtol=1e-12, atol=1e-12, err_msg=name)
-    np.testing.assert_allclose(
-        discrete_reference.acceleration(q, qd), expected_reference.acceleration(q, qd), rtol=1e-9
-    )
-    state = {"q": q[0], "qd": qd[0]}
-    assert expected_reference.terms("energy", state) >= abs(
-        expected_reference.evaluate("kinetic", q[0], qd[0])
-    ) * (1 - 1e-12)
+    for reference in (reference_for(system), TaylorReference(system)):
+        for name in names:
+            result, expected = reference.evaluate(name, q, qd), core.evaluate(name, *at_core)
+            if name in ("D", "C"):
+                assert (result[:, ~moving] == float(name == "D") * np.eye(n)[~moving]).all()
+                result = result[:, moving]
+            if name in (*MATRICES, *VECTORS):
+                assert not result[..., ~moving].any()
+                result = result[..., moving]
+            if name in ("kinetic", "energy"):
+                result = result - np.sum(qd[:, ~moving] ** 2, axis=1) / 2
+            np.testing.assert_allclose(result, expected, rtol=1e-12, atol=1e-12, err_msg=name)
+        accelerations = reference.acceleration(q, qd)
+        assert not accelerations[:, ~moving].any()
+        expected = core.acceleration(*at_core)
+        np.testing.assert_allclose(accelerations[:, moving], expected, rtol=1e-9)
+    kinetic = reference_for(system).evaluate("kinetic", q[0], qd[0])
+    terms = reference_for(system).terms("energy", {"q": q[0], "qd": qd[0]})
+    assert terms >= abs(kinetic) * (1 - 1e-12)
 
 
 @pytest.mark.slow

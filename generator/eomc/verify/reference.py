@@ -2,9 +2,8 @@
 
 `symbolic.SymbolicReference` evaluates expressions written out, `taylor.TaylorReference` uses dual
 numbers along the definitions. Both take many states at once, as leading rows of their arguments.
-Constraints are solved by `kkt`. `DiscreteReference` adds the parameters that jumps at events set to
-one of the two, as discrete variables: each has D = 1, no other entry in its rows, and the kinetic
-energy s_dot**2/2.
+Constraints are solved by `kkt`. Parameters that jumps at events set are discrete variables, which
+have the kinetic energy s_dot**2/2: each has D = 1, and no other entry in its rows and columns.
 
 `runge_kutta_step` is a step of any method by its tableau, for a given acceleration function.
 Generated steppers are compared with it. It stores all stages, and has nothing in common with the
@@ -38,6 +37,7 @@ Params = Mapping[str, Any] | None  # parameter values in place of defaults, by n
 Values = tuple[Any, ...]  # of all parameters, in the system's order: numbers, or arrays (b,)
 
 MATRICES = ("D", "C", "constraint_jacobian")
+VECTORS = ("g", "bias", "tau", "friction")
 SCALARS = ("kinetic", "potential", "energy", "jacobi", "power", "energy_terms", "power_terms")
 
 
@@ -100,7 +100,28 @@ class ReferenceModel(ABC):
         """
         q = np.asarray(q, float)
         qd = np.zeros_like(q) if qd is None else np.asarray(qd, float)
-        return self.value(name, q, qd, t, u, self._values(params))
+        moving = np.ones(q.shape[-1])
+        moving[self._discrete] = 0.0
+        value = self.value(name, q, moving * qd, t, u, self._values(params))
+        if name in ("kinetic", "energy", "jacobi"):
+            value = value + np.sum(qd[..., self._discrete] ** 2, axis=-1) / 2
+        return self.without_discrete_rows(name, value)
+
+    @cached_property
+    def _discrete(self) -> list[int]:
+        """Indices of the discrete variables, on whose velocities only energies depend."""
+        names = self.system.discrete
+        return [k for k, c in enumerate(self.system.coordinates) if c.name in names]
+
+    def without_discrete_rows(self, name: str, value: Any) -> Any:
+        """Return the value of `name` with the rows and columns of discrete variables cleared."""
+        k = self._discrete
+        if k and name in (*VECTORS, *MATRICES):
+            value[..., k] = 0.0
+            if name in ("D", "C"):
+                value[..., k, :] = 0.0
+                value[..., k, k] = float(name == "D")
+        return value
 
     def mass_and_force(
         self, q: ArrayLike, qd: ArrayLike, t: ArrayLike = 0.0, u: ArrayLike | None = None,
@@ -358,86 +379,6 @@ def by_rows(x: ArrayLike, rows: int) -> list[Any]:
     """Return a list of `rows` values: the entries of x, or x repeated if it is a single number."""
     each: list[Any] = [np.asarray(x).tolist()] * rows
     return each if np.ndim(x) == 0 else np.broadcast_to(x, rows).tolist()
-
-
-VECTORS = ("g", "bias", "tau", "friction")
-WITH_KINETIC_ENERGY = ("kinetic", "energy", "jacobi")
-
-
-class DiscreteReference(ReferenceModel):
-    """Reference of a system with discrete variables: parameters that jumps at events set.
-
-    A reference is the independent evaluation of the equations in Python. system: the system, with
-    the discrete variables as additional coordinates. core: the reference of the same system with
-    the discrete variables as parameters.
-    """
-
-    def __init__(self, system: System, core: ReferenceModel) -> None:
-        self.system, self.core = system, core
-        names = [c.name for c in system.coordinates]
-        self.continuous_indices = [k for k, name in enumerate(names) if name not in system.discrete]
-        self.discrete_indices = [k for k, name in enumerate(names) if name in system.discrete]
-
-    def terms(self, name: str, s: Mapping[str, Any]) -> float:
-        """Return the sum of the absolute values of all terms of "energy" or "power" at a state.
-
-        s: the arguments of `evaluate` by name. See `ReferenceModel.terms`.
-        """
-        q, qd = np.asarray(s["q"]), np.asarray(s["qd"])
-        values = {self.system.coordinates[k].name: float(q[k]) for k in self.discrete_indices}
-        params = {**(s.get("params") or {}), **values}
-        own = {
-            **s,
-            "q": q[self.continuous_indices],
-            "qd": qd[self.continuous_indices],
-            "params": params,
-        }
-        added = float(np.sum(qd[self.discrete_indices] ** 2)) / 2 if name == "energy" else 0.0
-        return self.core.terms(name, own) + added
-
-    def value(
-        self, name: str, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
-    ) -> Any:
-        """Return the value of `name`; see `ReferenceModel.value`."""
-        value = np.asarray(self.core.value(name, *self._core_arguments(q, qd, t, u, values)))
-        if name in WITH_KINETIC_ENERGY:
-            value = value + np.sum(qd[..., self.discrete_indices] ** 2, axis=-1) / 2
-        elif name in VECTORS or name == "constraint_jacobian":
-            value = self._with_discrete_columns(value)
-        elif name in ("D", "C"):
-            value = self._with_discrete_block(value, float(name == "D"))
-        return value[()]
-
-    def _core_arguments(
-        self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
-    ) -> tuple[Vector, Vector, Any, ArrayLike | None, Values]:
-        """Return the arguments of the core reference, discrete variables among the parameters."""
-        discrete = (q[..., k] for k in self.discrete_indices)
-        return (
-            q[..., self.continuous_indices],
-            qd[..., self.continuous_indices],
-            t,
-            u,
-            (*values, *discrete),
-        )
-
-    def _with_discrete_columns(self, columns: Vector) -> Vector:
-        """Return the values with zeros for the discrete variables, (..., nq)."""
-        result = np.zeros(
-            (*columns.shape[:-1], len(self.continuous_indices) + len(self.discrete_indices))
-        )
-        result[..., self.continuous_indices] = columns
-        return result
-
-    def _with_discrete_block(self, matrix: Vector, diagonal: float) -> Vector:
-        """Return the matrix (..., nq, nq) with `diagonal` on the discrete variables' diagonal."""
-        result = np.swapaxes(
-            self._with_discrete_columns(np.swapaxes(self._with_discrete_columns(matrix), -1, -2)),
-            -1,
-            -2,
-        )
-        result[..., self.discrete_indices, self.discrete_indices] = diagonal
-        return result
 
 
 MAX_SWEEPS = 20  # iterations for the stages of an implicit method, with a contraction by 1/7

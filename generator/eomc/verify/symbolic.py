@@ -28,12 +28,10 @@ from sympy.polys.polyerrors import PolynomialError
 from sympy.polys.rings import PolyElement, sring
 
 from eomc.model.algebra import compile_function
-from eomc.model.hybrid import with_constant_parameters
 from eomc.model.system import System, dot, t
 from eomc.verify.reference import (
     MATRICES,
     SCALARS,
-    DiscreteReference,
     Params,
     ReferenceModel,
     Values,
@@ -379,11 +377,8 @@ def without_definitions(system: System) -> System:
 def reference_for(system: System) -> ReferenceModel:
     """Return the reference of a system: its independent evaluation in Python, used by the checks.
 
-    It is symbolic (`derive`) for a small system, otherwise numerical (`TaylorReference`). If jumps
-    at events set parameters, the result is a `DiscreteReference`, which contains such a reference.
+    It is symbolic (`derive`) for a small system, otherwise numerical (`TaylorReference`).
     """
-    if system.discrete:
-        return DiscreteReference(system, reference_for(with_constant_parameters(system)))
     return derive(system) if is_small(system) else TaylorReference(system)
 
 
@@ -513,8 +508,9 @@ class SymbolicReference(ReferenceModel):
     ) -> tuple[Vector, Vector]:  # fmt: skip
         """Return D and τ - bias, by one call of a compiled function."""
         motion, n = self.evaluate("motion", q, qd, t, u, params), len(self.system.q)
-        D, bias, tau = motion[..., : n * n], motion[..., n * n : -n], motion[..., -n:]
-        return D.reshape(*np.shape(q), n), tau - bias
+        D = motion[..., : n * n].reshape(*np.shape(q), n)
+        force = motion[..., -n:] - motion[..., n * n : -n]
+        return self.without_discrete_rows("D", D), self.without_discrete_rows("tau", force)
 
     def _states(
         self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
