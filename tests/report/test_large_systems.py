@@ -203,7 +203,7 @@ def rotation_matrix(axis: int, angle: float) -> np.ndarray:
 def evaluate_printed_recursion(
     system: System, tree: Tree, values: dict[Any, Any], qdd: np.ndarray
 ) -> tuple[np.ndarray, float, float]:
-    """Evaluate D qdd + C qd + g, K and P by the lines of `_latex_recursion`."""
+    """Evaluate D qdd + C qd + g, K and P by the lines of recursion.tex.jinja."""
 
     def number(e: Any) -> float:
         return float(sympy.sympify(e).subs(values))

@@ -381,11 +381,6 @@ def _spatial_inertia(mass: float, center: Array, root: Array) -> Array:
     return np.block([[root.T @ root - coupled @ c, coupled], [-coupled, mass * np.eye(3)]])
 
 
-def _rotation_matrix(axis: Array, angle: float) -> Array:
-    """Return the rotation by an angle about a unit axis."""
-    return np.array(spatial.axis_angle_rotation(axis.tolist(), math.cos(angle), math.sin(angle)))
-
-
 def null_space(columns: Array) -> Array:
     """Return a basis of the null space of a matrix, made sparse by elimination.
 

@@ -16,6 +16,7 @@ from sympy import Expr
 
 from eomc.base.errors import EomcError
 from eomc.derive import lagrange
+from eomc.emit.common.templates import environment
 from eomc.model.hybrid import with_constant_parameters
 from eomc.model.symbols import needed_definitions
 from eomc.model.system import System, t
@@ -46,7 +47,6 @@ from eomc.runtime.plot import tex
 
 MAX_DEFINITIONS = 60  # definitions that are shown
 LINES_PER_ENVIRONMENT = 40  # joints that fill a page
-T, DQ = r"^{\mathsf{T}}", r"\dot{q}"
 
 
 def write_equations(system: System, form: str = "text") -> str:
@@ -174,9 +174,24 @@ def describe_in_latex(system: System) -> str:
     It consists of align* environments of the package amsmath.
     """
     write, tree = Typesetter(system), system.tree
-    parts = [_latex_form(system)]
+    forces = [r"\tau"] * _has_forces(system) + [r"A^{\mathsf{T}} \lambda"] * bool(
+        system.constraints
+    )
+    text = (
+        environment()
+        .get_template("report/recursion.tex.jinja")
+        .render(
+            force=" + ".join(forces) or "0",
+            order=r", \; ".join(tex(c.name) for c in system.coordinates),
+            is_quadratic=_is_quadratic(system),
+            gravity=tree and _vector(tree.gravity, write),
+            has_armature=tree and any(link.armature != 0 for link in tree.links),
+            has_other_kinetic=tree and tree.other_kinetic != 0,
+            has_other_potential=tree and tree.other_potential != 0,
+        )
+    )
+    parts = [text.splitlines()]
     if tree is not None:
-        parts[0] += _latex_recursion(tree, write)
         links = [line for k in range(len(tree.links)) for line in _latex_link(k, tree, write)]
         parts += [
             links[k : k + LINES_PER_ENVIRONMENT]
@@ -188,75 +203,16 @@ def describe_in_latex(system: System) -> str:
     return align(parts)
 
 
-def _latex_form(system: System) -> list[str]:
-    """Return the lines of the equation of motion, and of D, C and g as derivatives."""
-    force = " + ".join(
-        [*([r"\tau"] * _has_forces(system)), *([rf"A{T} \lambda"] * bool(system.constraints))]
-    )
-    force = force or "0"
-    order = r", \; ".join(tex(c.name) for c in system.coordinates)
-    lines = [
-        rf"  & D \, \ddot{{q}} + C \, \dot{{q}} + g = {force}, \quad q = \left({order}\right){T}",
-        rf"  & \frac{{d}}{{dt}} {_slope('L', DQ)} - {_slope('L', 'q')} = {force}, \quad L = K - P",
-        rf"  D_{{ij}} &= \frac{{\partial^{{2}} K}}{{\partial {DQ}_{{i}} \, \partial {DQ}_{{j}}}}",
-    ]
-    if _quadratic(system):
-        slopes = (("D_{ij}", "q_{k}"), ("D_{ik}", "q_{j}"), ("D_{jk}", "q_{i}"))
-        ij, ik, jk = (_slope(e, q) for e, q in slopes)
-        lines += [
-            rf"  C_{{ij}} &= \frac{{1}}{{2}} \sum_{{k}} \left({ij} + {ik} - {jk}\right) {DQ}_{{k}}",
-            rf"  g &= {_slope('P', 'q')}",
-        ]
-    return lines
-
-
 def _has_forces(system: System) -> bool:
     """True if anything acts besides potentials and constraint forces."""
     return bool(system.applied) or any(e != 0 for e in (system.dissipation, *system.forces))
 
 
-def _quadratic(system: System) -> bool:
+def _is_quadratic(system: System) -> bool:
     """True if K is known to be homogeneous quadratic in the velocities."""
     tree = system.tree
     timed = any(e.has(t) for _, e in system.definitions)
     return tree is not None and not timed and tree.other_kinetic == 0
-
-
-def _latex_recursion(tree: Tree, write: Typesetter) -> list[str]:
-    """Return `_recursion` in LaTeX, with twists (angular, linear) and wrenches (moment, force)."""
-    K, P = "K'", "P'"
-    wrench, energy = rf"S_{{k}}{T} f_{{k}}", rf"v_{{k}}{T} I_{{k}} \, v_{{k}}"
-    if any(link.armature != 0 for link in tree.links):
-        wrench = rf"\left({wrench} + \alpha_{{k}} \ddot{{s}}_{{k}}\right)"
-        energy = rf"\left({energy} + \alpha_{{k}} \dot{{s}}_{{k}}^{{2}}\right)"
-    other_terms = f" + {_slope(P, 'q')}" * (tree.other_potential != 0)
-    if tree.other_kinetic != 0:
-        other_terms += rf" + \frac{{d}}{{dt}} {_slope(K, DQ)} - {_slope(K, 'q')}"
-    turned, r, c = rf"R_{{k}}{T}", r"[r_{k}]_{\times}", r"[c_{k}]_{\times}"
-    X, body = [[turned, "0"], [f"-{turned} {r}", turned]], [["J_{k}", c], [f"-{c}", "m_{k}"]]
-    return [
-        r"  & \text{Joint } k \text{ on } p \text{ moves by } s_{k} \text{ along } S_{k}; "
-        r"\; r_{k}, R_{k} \text{: its frame in that of } p;",
-        rf"{CONTINUATION}v_{{k}}, a_{{k}} \text{{: its twist (angular, linear) and the rate; }} "
-        r"f_{k} \text{: its wrench;}",
-        rf"{CONTINUATION}m_{{k}}, c_{{k}}, J_{{k}} \text{{: mass, mass times its centre, inertia "
-        r"about the frame's origin.}",
-        r"  v_{k} &= X_{k} \, v_{p} + S_{k} \, \dot{s}_{k}, \quad v_{0} = 0",
-        r"  a_{k} &= X_{k} \, a_{p} + S_{k} \, \ddot{s}_{k} + v_{k} \times S_{k} \, \dot{s}_{k}, "
-        rf"\quad a_{{0}} = \left(0, -\gamma\right), \; \gamma = {_vector(tree.gravity, write)}",
-        r"  f_{k} &= I_{k} \, a_{k} + v_{k} \times^{*} I_{k} \, v_{k} + "
-        rf"\sum_{{p(c) = k}} X_{{c}}{T} f_{{c}}",
-        rf"  D \, \ddot{{q}} + C \, {DQ} + g &= \sum_{{k}} {_slope('s_{k}', 'q')} "
-        rf"{wrench}{other_terms}",
-        rf"  K &= \frac{{1}}{{2}} \sum_{{k}} {energy}"
-        + f" + {K}" * (tree.other_kinetic != 0)
-        + r", \quad "
-        rf"P = -\gamma{T} \sum_{{k}} \left(m_{{k}} \, o_{{k}} + O_{{k}} \, c_{{k}}\right)"
-        + f" + {P}"
-        * (tree.other_potential != 0),
-        r"  o_{k} &= o_{p} + O_{p} \, r_{k}, \quad O_{k} = O_{p} \, R_{k}, \quad O_{0} = 1",
-        rf"  X_{{k}} &= {_matrix(X)}, \quad I_{{k}} = {_matrix(body)}",
-    ]
 
 
 def _latex_link(k: int, tree: Tree, write: Typesetter) -> list[str]:
@@ -298,14 +254,10 @@ def _latex_forces(system: System) -> list[str]:
     """Return the line that says of what the generalized forces consist, in a list."""
     if not _has_forces(system):
         return []
-    friction = f" - {_slope('R', DQ)}" * (system.dissipation != 0)
+    friction = r" - \frac{\partial R}{\partial \dot{q}}" * (system.dissipation != 0)
     count = range(1, len(system.applied) + 1)
-    applied = "".join(f" + {_slope(f'y_{{{k}}}', 'q')} F_{{{k}}}" for k in count)
+    applied = "".join(rf" + \frac{{\partial y_{{{k}}}}}{{\partial q}} F_{{{k}}}" for k in count)
     return [rf"  \tau &= Q{friction}{applied}"]
-
-
-def _slope(numerator: str, denominator: str) -> str:
-    return rf"\frac{{\partial {numerator}}}{{\partial {denominator}}}"
 
 
 def _formula(e: Expr, write: Typesetter) -> str:
