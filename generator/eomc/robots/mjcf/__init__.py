@@ -401,7 +401,7 @@ def read_actuators(
     for tag in tags:
         if tag.kind not in ACTUATORS:
             continue
-        a = reader.attributes_with_defaults(Placed(tag, "", IDENTITY_TRANSFORM, ""), "actuator")
+        a = reader.attributes_with_defaults(Placed(tag), "actuator")
         on = a.get("joint", a.get("jointinparent", a.get("tendon")))
         name = a.get("name") or unique_name(f"{on or 'no'}_{tag.kind}", names)
         names.add(name)

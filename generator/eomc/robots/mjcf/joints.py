@@ -421,7 +421,7 @@ class Tendons:
 
     def _read(self, tendon: Tendon, tag: Tag) -> Tendon:
         report, name = self._reader.report, tag.get("name")
-        a = self._reader.attributes_with_defaults(Placed(tag, "", IDENTITY_TRANSFORM, ""), "tendon")
+        a = self._reader.attributes_with_defaults(Placed(tag), "tendon")
         own = {key: a.linear_coefficient(key, "tendons", name) for key in ("stiffness", "damping")}
         own["armature"] = a.number("armature")
         for key, value in own.items():
@@ -545,9 +545,7 @@ class _Reading:
         `tag` is the element of the constraint in the file.
         """
         report = self.reader.report
-        a = self.reader.attributes_with_defaults(
-            Placed(tag, "", IDENTITY_TRANSFORM, ""), "equality"
-        )
+        a = self.reader.attributes_with_defaults(Placed(tag), "equality")
         ends = [a.get(f"{what}{k}") for k in "12" for what in ("body", "joint", "tendon", "site")]
         name = a.get("name") or "_".join([tag.kind, *filter(None, ends)])
         name = unique_name(name, self.taken)

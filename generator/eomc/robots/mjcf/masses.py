@@ -10,6 +10,7 @@ from eomc.base.spatial import as_inertia, cross, dot, plus, point_inertia, trans
 from eomc.robots import geometry
 from eomc.robots.geometry import (
     IDENTITY,
+    IDENTITY_TRANSFORM,
     NO_INERTIA,
     ORIGIN,
     Inertia,
@@ -72,9 +73,9 @@ class Placed:
     """
 
     tag: Tag
-    body: str
-    pose: Transform
-    childclass: str
+    body: str = ""
+    pose: Transform = IDENTITY_TRANSFORM
+    childclass: str = ""
 
 
 @dataclass(frozen=True)
