@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, count
 from math import inf
@@ -29,6 +29,7 @@ from eomc.program.ir import Function, evaluate, nearby
 from eomc.program.lower import lower
 from eomc.program.outline import weight
 from eomc.program.program import TIME, Program
+from eomc.scene import formulas
 from eomc.scene.formulas import parse
 from eomc.scene.schema import ACTIONS
 
@@ -473,7 +474,8 @@ _OTHERS: Mapping[str, tuple[float, tuple[int, ...]]] = {
     "Ω": (1.0, _SI["Ohm"]),
     "%": (0.01, _NONE),
 }
-_TOKEN = re.compile(r"\s*(\*\*|[*/()^·.]|-?\d+|[A-Za-zµΩ°%]+|[⁻⁰¹²³⁴-⁹]+)")
+# a unit, and its power as FMI writes it: s-2; or 1, which is no power
+_WORD = re.compile(r"([A-Za-zµΩ°%]+|(?<![\d^-])(?<!\*\*)1(?!\d))(?:\s*(-?\d+))?")
 _RAISED = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 _MOST = 20  # largest magnitude of an exponent
 
@@ -489,10 +491,17 @@ class UnitOfMeasurement:
     factor: float
     powers: tuple[int, ...]
 
-    def times(self, other: UnitOfMeasurement, power: int) -> UnitOfMeasurement:
-        """Return the product of this unit and `other` raised to the integer `power`."""
-        powers = (a + power * b for a, b in zip(self.powers, other.powers, strict=True))
-        return UnitOfMeasurement(self.factor * other.factor**power, tuple(powers))
+    def __mul__(self, other: UnitOfMeasurement) -> UnitOfMeasurement:
+        powers = (a + b for a, b in zip(self.powers, other.powers, strict=True))
+        return UnitOfMeasurement(self.factor * other.factor, tuple(powers))
+
+    def __pow__(self, power: int) -> UnitOfMeasurement:
+        if abs(power) > _MOST:
+            raise ValueError("no unit has such a power")
+        return UnitOfMeasurement(self.factor**power, tuple(power * n for n in self.powers))
+
+    def __truediv__(self, other: UnitOfMeasurement) -> UnitOfMeasurement:
+        return self * other**-1
 
     @property
     def attributes(self) -> tuple[tuple[str, str], ...]:
@@ -517,66 +526,29 @@ def parse_unit(text: str) -> UnitOfMeasurement | None:
     >>> parse_unit("furlongs") is parse_unit("") is None
     True
     """
-    tokens: list[str] = []
-    at = 0
-    text = text.rstrip()
-    while at < len(text):
-        match = _TOKEN.match(text, at)
-        if match is None:
-            return None
-        tokens.append(match[1])
-        at = match.end()
-    if not tokens:
-        return None
+    units: dict[str, UnitOfMeasurement] = {}
+
+    def name(match: re.Match[str]) -> str:
+        units[new := f"u{len(units)}"] = _word(match[1])
+        return new + (f"**{match[2]}" if match[2] else "")
+
+    text = re.sub(r"[⁻⁰¹²³⁴-⁹]+", lambda match: f"^{match[0].translate(_RAISED)} ", text)
     try:
-        left = iter([*tokens, ""])
-        meaning, end = _product(left, next(left))
-    except (ValueError, OverflowError):
+        text = re.sub(r"[·.]", "*", _WORD.sub(name, text)).replace("^", "**")
+        product = formulas.parse(re.sub(r"(?<=[\w)])\s+(?=[\w(])", "*", text))
+        meaning = formulas.evaluate(product, {"number": int}, units.__getitem__)
+        if re.search(r"\*\*[-\d ]+\*\*", product.text):  # a power of a power
+            return None
+        fits = all(abs(n) <= _MOST for n in meaning.powers) and 1e-60 < meaning.factor < 1e60
+    except (ValueError, TypeError, AttributeError, OverflowError):
         return None
-    fits = all(abs(n) <= _MOST for n in meaning.powers) and 1e-60 < meaning.factor < 1e60
-    return meaning if end == "" and fits else None
-
-
-def _product(left: Iterator[str], token: str) -> tuple[UnitOfMeasurement, str]:
-    """Parse factors up to a bracket or the end. A slash applies to the next factor only."""
-    meaning, sign = ONE, 1
-    while True:
-        factor, token = _factor(left, token)
-        meaning, sign = meaning.times(factor, sign), 1
-        if token in ("*", "·", "."):
-            token = next(left)
-        elif token == "/":
-            sign, token = -1, next(left)
-        elif token in ("", ")"):
-            return meaning, token
-
-
-def _factor(left: Iterator[str], token: str) -> tuple[UnitOfMeasurement, str]:
-    """Parse a unit or a bracket with its power. Returns it and the next token."""
-    if token == "(":
-        meaning, end = _product(left, next(left))
-        if end != ")":
-            raise ValueError("a bracket is open")
-    elif token == "1":
-        meaning = ONE
-    else:
-        meaning = _word(token)
-    token = next(left)
-    if token in ("^", "**"):
-        power, token = int(next(left)), next(left)
-    elif re.fullmatch(r"-?\d+", token):  # as FMI writes them: m/s2
-        power, token = int(token), next(left)
-    elif token and token[0] in "⁻⁰¹²³⁴⁵⁶⁷⁸⁹":
-        power, token = int(token.translate(_RAISED)), next(left)
-    else:
-        power = 1
-    if abs(power) > _MOST:
-        raise ValueError("no unit has such a power")
-    return ONE.times(meaning, power), token
+    return meaning if fits else None
 
 
 def _word(word: str) -> UnitOfMeasurement:
     """Return the meaning of a unit with an optional prefix. Raises ValueError."""
+    if word == "1":
+        return ONE
     if word in _OTHERS:
         return UnitOfMeasurement(*_OTHERS[word])
     if word in _SI:
