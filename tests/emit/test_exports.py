@@ -139,9 +139,9 @@ def test_accelerations_for_casadi_agree_with_the_module(scene: str) -> None:
 
 @casadi_scenes
 def test_compiled_jacobians_agree_with_those_of_symbolic_accelerations(scene: str) -> None:
+    package = exported(scene, "casadi")
     import casadi
 
-    package = exported(scene, "casadi")
     x, u, p = random_point(package, 7)
     arguments = [casadi.MX.sym(n, len(v)) for n, v in zip("xupt", (x, u, p, [0.0]), strict=True)]
     jacobians = []
