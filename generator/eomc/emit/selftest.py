@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache, cached_property, partial
-from itertools import chain, islice
+from itertools import chain, islice, pairwise
 from typing import Any
 
 from eomc.emit.common.c_expression import DOUBLE
@@ -239,37 +239,23 @@ class _Cases:
         """
         values = self.complete(point)
         if name in self.program:
-            return self.ordered(name, self.evaluate(name, values))
-        if f"{name}_column" in self.program:
-            return self.by_columns(name, values)
-        if name == "energy":
+            results = self.evaluate(name, values)
+            rows = [results[k : k + self.width] for k in range(0, len(results), self.width)]
+        elif f"{name}_column" in self.program:
+            rows = self.by_columns(name, values)
+        elif name == "energy":
             parts = (self.evaluate(f"{n}_energy", values)[0] for n in ("kinetic", "potential"))
             return [sum(parts)]
-        raise NoCaseError
-
-    def ordered(self, name: str, values: Vector) -> Vector:
-        """Return the results of the program's function `name` in the order in which C stores them.
-
-        The order differs only for the linearization: C stores its matrices A_q, A_qd and B one
-        after the other.
-        """
-        if name != "linearization":
-            return values
-        return self.linearization_order(
-            [values[k : k + self.width] for k in range(0, self.nq * self.width, self.width)]
-        )
-
-    def linearization_order(self, rows: Sequence[Sequence[float]]) -> Vector:
-        """Return the entries of A_q, then of A_qd, then of B, each by rows.
-
-        rows: the rows of the matrix [A_q, A_qd, B].
-        """
+        else:
+            raise NoCaseError
         n = self.nq
-        parts = ((0, n), (n, 2 * n), (2 * n, self.width))
-        return [x for a, b in parts for row in rows for x in row[a:b]]
+        ends: tuple[int, ...] = (0, self.width)
+        if name == "linearization":  # A_q, A_qd and B one after the other
+            rows, ends = rows[:n], (0, n, 2 * n, self.width)
+        return [x for a, b in pairwise(ends) for row in rows for x in row[a:b]]
 
-    def by_columns(self, name: str, values: Mapping[str, float]) -> Vector:
-        """Return a matrix such as D or the linearization, as C stores it.
+    def by_columns(self, name: str, values: Mapping[str, float]) -> list[Vector]:
+        """Return the rows of a matrix such as D or the linearization.
 
         It is computed by columns: the program has a function for the product of the matrix and a
         vector, and column k is the product with unit vector k. `values` are the arguments by name.
@@ -281,12 +267,7 @@ class _Cases:
             self.evaluate(f"{name}_column", {**values, **zero, add_suffix(n, ALONG): 1.0})
             for n in own
         ]
-        rows = [list(row) for row in zip(*columns, strict=True)]
-        return (
-            self.linearization_order(rows)
-            if name == "linearization"
-            else [x for row in rows for x in row]
-        )
+        return [list(row) for row in zip(*columns, strict=True)]
 
     def complete(self, point: TestPoint) -> Values:
         """Return the values of a point by name, including the inputs.
