@@ -225,7 +225,7 @@ CASES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", tiers(CASES, "bounce with signals", "simultaneous"))
+@pytest.mark.parametrize("case", tiers(CASES, "simultaneous"))
 def test_derivatives_through_events_agree_with_differences_of_fifty_digits(
     modules: Modules, case: str
 ) -> None:
@@ -295,6 +295,7 @@ def test_gradients_of_implicit_and_adaptive_runs_agree_with_short_explicit_steps
     np.testing.assert_allclose(gradient(**steps), expected, rtol=0, atol=1e-9 * abs(expected).max())
 
 
+@pytest.mark.slow
 def test_sensitivities_of_an_adaptive_run_pass_through_events(modules: Modules) -> None:
     m = modules.unoptimised(TABLE_TENNIS)
     runs = [m.simulate(duration=2.0, **steps) for steps in ({"tol": 1e-13}, {"h": 0.001})]
@@ -315,6 +316,7 @@ BATCH = RUN.replace('["rk4", "dp8", "gauss8", "gauss16"]', '"rk4"\nbatch = true'
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("duration", [0.9, 0.1])
 def test_instances_of_batches_have_the_derivatives_of_single_runs(
     modules: Modules, duration: float
@@ -442,7 +444,8 @@ WRONG_SIGNS = {
 }
 
 
-@pytest.mark.parametrize("right", tiers(WRONG_SIGNS, "by_start += by_time"))
+@pytest.mark.slow
+@pytest.mark.parametrize("right", WRONG_SIGNS)
 def test_each_term_of_the_derivatives_by_times_counts(
     monkeypatch: pytest.MonkeyPatch, modules: Modules, tmp_path: Path, right: str
 ) -> None:
@@ -468,6 +471,7 @@ def test_each_term_of_the_derivatives_by_times_counts(
     assert np.max(np.abs(values - expected)) > 1e-7 * np.max(np.abs(expected))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["event_slopes", "jump_vjp"])
 def test_check_detects_wrong_derivatives_of_events(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str
