@@ -73,9 +73,10 @@ class Program:
     def solved(self) -> str:
         """A sentence that says how D qdd = tau - bias is solved."""
         names = ", ".join(self.system.coordinates[k].name for k in self.order)
-        off_diagonal = (x for k, x in enumerate(self["D"].outputs) if k % (len(self.order) + 1))
-        if not self.system.constraints and not any(x.coefficient for x in off_diagonal):
-            return "a = qdd = (tau - bias)/D: D is diagonal."
+        if "D" in self and not self.system.constraints:
+            entries, period = enumerate(self["D"].outputs), len(self.order) + 1
+            if not any(x.coefficient for k, x in entries if k % period):
+                return "a = qdd = (tau - bias)/D: D is diagonal."
         return ROUTES[self["acceleration"].route].solved(self.system, names)
 
 
