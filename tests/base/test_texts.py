@@ -166,6 +166,7 @@ def test_loop_note_with_hidden_characters_is_refused(payload: str) -> None:
     assert refused == should_be_refused(payload, lines=True)
 
 
+@pytest.mark.slow
 def test_ordinary_texts_and_multiline_notes_are_accepted() -> None:
     note = "first line\nsecond *line*,\n\n\tindented: θ"
     for which, key in fields():

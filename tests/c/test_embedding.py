@@ -405,6 +405,7 @@ tolerance = 1e-10
 """
 
 
+@pytest.mark.slow
 def test_example_with_events_uses_adaptive_steps(modules: Modules, tmp_path: Path) -> None:
     (tmp_path / "bouncing.toml").write_text(BOUNCING, encoding="utf-8")
     pipeline.write_c(tmp_path / "bouncing.toml", tmp_path / "c")

@@ -190,6 +190,7 @@ def test_exponentials_are_included_only_if_a_scene_needs_them() -> None:
         assert "_wide(" not in plain
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("real", tiers(["double", "float"], "double"))
 def test_batch_equals_separate_runs(real: str, tmp_path: Path) -> None:
     module = eomc.load(system("exp(x - y) + exp(y - x)", "-tanh(x_dot/0.1)", real), tmp_path)

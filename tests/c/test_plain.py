@@ -229,6 +229,7 @@ def check_plain(name: str, fast: ModuleType, plain: ModuleType, states: int) -> 
     return [row for table in tables for row in comparison.report(table)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", tiers([*NAMES, "steppers", "driven", "single", "everything"], "single")
 )

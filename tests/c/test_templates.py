@@ -14,7 +14,7 @@ from eomc.scene.read import parse
 TEXTS = {file.stem: (file.stem, "") for file in sorted(SCENES.glob("*.toml"))} | RUN_VARIANTS
 
 
-@pytest.mark.parametrize("name", tiers(TEXTS, "cartpole", "batch by a tolerance"))
+@pytest.mark.parametrize("name", tiers(TEXTS, "cartpole"))
 def test_every_way_through_the_c_code_gives_the_same_motion(name: str, modules: Modules) -> None:
     system = assembled(from_scene(parse(text_of(*TEXTS[name]), f"{name}.toml")))
     report = check_templates(system, modules.unoptimised(system))

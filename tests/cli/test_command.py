@@ -52,6 +52,7 @@ def eomc(*words: str) -> Result:
     return CliRunner().invoke(main, words)
 
 
+@pytest.mark.slow
 def test_new_scene_runs_unchanged(scene_folder: Path) -> None:
     assert eomc("new", "crane").exit_code == 0
     ran = eomc("run", "crane.toml", "--out", "run.csv", "--plot", "run.png", "--animate", "a.html")

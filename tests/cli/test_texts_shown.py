@@ -225,6 +225,7 @@ with options.progress_bar({given!r}, False) as progress:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["markup", "escape"])
 def test_progress_shows_texts_literally(name: str) -> None:
     """Rich writes its own markup and controls; those in a file name are text."""
@@ -319,6 +320,7 @@ def test_robot_files_with_hostile_names_are_imported(kind: str, work_folder: Pat
     assert imported >= len(PLAIN) + 8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", tiers([URDF, MJCF], MJCF), ids=["urdf", "mjcf"])
 @pytest.mark.parametrize(
     "name",

@@ -141,6 +141,7 @@ def test_long_chain_is_linearized_by_columns() -> None:
     assert np.max(np.abs(ends[0] - ends[1])) < 1e-9
 
 
+@pytest.mark.slow
 def test_columns_of_a_chain_share_their_operations() -> None:
     text = point_masses.links([*range(-1, 7)], equal=False) + "\n[run]\nlinearize = true\n"
     functions = program.build(lagrange.derive(point_masses.read_system(text))).functions

@@ -103,6 +103,7 @@ WAYS = pytest.mark.parametrize(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", tiers(SHAPES, "pendulum", "fork"))
 @WAYS
 def test_masses_on_links_agree_with_lagrange(shape: str, equal: bool, relative: bool) -> None:
@@ -204,7 +205,7 @@ KINDS = {
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", tiers(KINDS, *list(KINDS)[::3]))
 def test_other_suitable_systems_agree_with_lagrange(kind: str) -> None:
     assert_agrees_with_lagrange(KINDS[kind])
 

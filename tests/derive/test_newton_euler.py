@@ -218,6 +218,7 @@ def two_bodies_with(joint: str, number: int, **more: Any) -> str:
 AXES = {"cylindrical": [2, -1, 2], "universal": [[1, 0, 0], [0.6, 0, 0.8]]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "joint, number",
     tiers(

@@ -383,6 +383,7 @@ def test_common_prefix_of_coordinates_is_removed_in_c(prefix: str) -> None:
     assert f"{prefix}lift" in program_from(text)["__init__.py"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "old, new",
     [

@@ -48,6 +48,7 @@ BATCH = "batch = true"
 IMPLICIT = 'method = "gauss4"\nlinearize = "parameters"'
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "run", tiers([BATCH, "", IMPLICIT], ""), ids=["batch", "plain", "implicit"]
 )

@@ -56,6 +56,7 @@ def test_angles_linear_in_coordinates_are_detected() -> None:
     assert not names & {name for a in angles for name in (a.sine, a.cosine)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("h", tiers((0.001, 0.02, 0.3), 0.02))
 def test_short_and_long_steps_agree_with_textbook(h: float, modules: Modules) -> None:
     """Angles change by about 1e-6, 1e-4 and, above the limit of rotations, 1e-1."""

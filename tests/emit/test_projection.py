@@ -85,6 +85,7 @@ def test_massless_coordinate_in_velocity_constraints_only_is_unchanged(modules: 
         assert q[1] == 0.2 if fixed_names else q[1] / q[0] == pytest.approx(0.2 / 1.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fixed_names", [(), ("q2",)])
 def test_change_is_minimal_in_the_metric_of_the_mass_matrix(
     modules: Modules, fixed_names: tuple[str, ...]

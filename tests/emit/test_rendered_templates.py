@@ -108,6 +108,7 @@ def variables_of(template: str) -> set[str]:
     return variables
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("template", sorted({*TEMPLATES} - INCLUDED))
 def test_template_gets_the_variables_that_it_reads(
     template: str, observed: dict[str, list[dict[str, Any]]]

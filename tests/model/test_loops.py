@@ -45,11 +45,8 @@ CASES = [
     for world in ("", "first", "second")
     if closing.rows(plane) and kind != "gear"
 ]
-# all kinds in space, between two bodies; one in the plane, one with the world at either end
-QUICK = [
-    pytest.param(*case, marks=() if case[1:] == (False, "") or case[0] == "weld" else SLOW)
-    for case in CASES
-]
+# all kinds in space, between two bodies
+QUICK = [pytest.param(*case, marks=() if case[1:] == (False, "") else SLOW) for case in CASES]
 
 
 def text(kind, plane, world):

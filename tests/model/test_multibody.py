@@ -182,8 +182,11 @@ def assert_close(result: Any, expected: Any, size: float = 1.0) -> None:
 
 @pytest.mark.parametrize(
     ("joint", "axis", "plane"),
-    [*((*joint, False) for joint in SPACE), *((*joint, True) for joint in PLANE)],
-    ids=str,
+    [
+        pytest.param(*joint, plane, id=f"{joint}-{plane}", marks=pytest.mark.slow if k % 3 else ())
+        for plane, joints in ((False, SPACE), (True, PLANE))
+        for k, joint in enumerate(joints)
+    ],
 )
 def test_energies_of_a_joint_agree_with_point_masses(joint: str, axis: Any, plane: bool) -> None:
     arm = Arm(joint, axis, plane)

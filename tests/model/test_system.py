@@ -538,6 +538,7 @@ def test_step_size_is_in_the_normal_range_of_the_type() -> None:
         make(2.0**-126.5)
 
 
+@pytest.mark.slow
 def test_long_sums_and_products_are_accepted() -> None:
     """Beyond the limits of formulas that are written as text."""
     product = sympy.Mul(*(x + k for k in range(1500)), evaluate=False)

@@ -279,6 +279,7 @@ def test_large_angle_does_not_affect_others_in_its_register(modules: Modules) ->
         np.testing.assert_allclose(module.potential_energy(q), 9.81 * height, rtol=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", tiers([0, 4], 4))
 def test_steps_at_an_angle_too_large_to_change(index: int, modules: Modules) -> None:
     """At 7e22 rad the spacing of doubles is 8e6; the other links swing about that link."""

@@ -111,6 +111,7 @@ def test_order_stability_and_rounding_are_measured() -> None:
     assert 1e-17 < min(p.along for p in dp8.points) < 1e-13
 
 
+@pytest.mark.slow
 def test_recommended_stepper_is_the_quickest_with_enough_digits() -> None:
     r = measured()
     for digits in (3, 6, 9, 12):

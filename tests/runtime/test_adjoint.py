@@ -255,6 +255,7 @@ x_dot = "-x_dot"
 """
 
 
+@pytest.mark.slow
 def test_runs_without_an_adjoint_are_refused(modules: Modules) -> None:
     m = modules.unoptimised(LOOP)
     steps = {"h": 0.02, "steps": 20}

@@ -388,6 +388,7 @@ def test_constraints_that_contradict_each_other_later_are_reported(tmp_path: Pat
 DEPENDENT = ["sin(x) + 0.7*y*y", "0.7*y*y - 2*sin(x)"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("formula", tiers(DEPENDENT, DEPENDENT[0]))
 def test_constraint_dependent_on_the_fixed_values_is_redundant(
     formula: str, tmp_path: Path

@@ -189,6 +189,7 @@ error = "sum_dot - (1 - phi)"
 """
 
 
+@pytest.mark.slow
 def test_velocities_that_violate_holonomic_constraints_are_reported(modules: Modules) -> None:
     bob = modules("pendulum_xy")
     q = bob.equilibrium().q
@@ -222,6 +223,7 @@ circuit = "0.5*i_dot + i + 0.1*phi_dot - 6"
 """
 
 
+@pytest.mark.slow
 def test_stick_friction_balances_forces_up_to_its_limit(modules: Modules) -> None:
     """10 x against 1 N, and against 2 N."""
     block = modules.unoptimised(STICKS)
@@ -231,6 +233,7 @@ def test_stick_friction_balances_forces_up_to_its_limit(modules: Modules) -> Non
     assert block.equilibrium([0.15], params={"F": 2.0})[0].tolist() == [0.15, 0.0]
 
 
+@pytest.mark.slow
 def test_linkage_reaches_equilibrium_from_a_local_minimum_of_the_residual(modules: Modules) -> None:
     """Regression: Newton's method ended between two equilibria, at a force of -1.31."""
     four_bar = modules.unoptimised(scene_system("four_bar"))

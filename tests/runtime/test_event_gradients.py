@@ -275,6 +275,7 @@ def draws(case: str) -> np.random.Generator:
     return np.random.default_rng([*case.encode()])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["gauss8", "gauss16", "adaptive"])
 def test_gradients_of_implicit_and_adaptive_runs_agree_with_short_explicit_steps(
     modules: Modules, method: str
@@ -375,6 +376,7 @@ y_dot = "-y_dot/2"
 {RUN.replace("0.05", "0.01")}"""
 
 
+@pytest.mark.slow
 def test_grazing_events_are_reported(modules: Modules) -> None:
     """The depth below which the ceiling counts as grazed is some roundings of the height."""
     m = modules.unoptimised(LOB)
@@ -393,6 +395,7 @@ def test_grazing_events_are_reported(modules: Modules) -> None:
             assert gradient.p[0] == pytest.approx(1 / speed, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_derivatives_through_events_that_do_not_exist_are_refused(modules: Modules) -> None:
     m, swung = modules.unoptimised(LOB), modules.unoptimised(TABLE_TENNIS)
     run = m.simulate(h=0.01, duration=2.2)

@@ -122,6 +122,7 @@ duration = 5.0
 """
 
 
+@pytest.mark.slow
 def test_multiplier_of_sticking_friction_is_an_output(modules: Modules) -> None:
     run = modules.unoptimised(STICKS).simulate()
     assert run.q[-1, 2] == 0 and abs(run.outputs["holds"][-1]) > 0.1

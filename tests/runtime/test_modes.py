@@ -56,6 +56,7 @@ def test_block_comes_to_rest_at_the_closed_form(block: ModuleType, tol: float) -
     assert run.qd[-1].tolist() == [0, 0] and run.slides[1] == -1 and run.slides[-1] == 0
 
 
+@pytest.mark.slow
 def test_block_on_a_belt_sticks_and_slides(modules: Modules) -> None:
     """The scene of docs/adaptive.md."""
     text = re.search(r"```toml\n(eomc = 1\nname = \"on_a_belt\".*?)```", PAGE.read_text(), re.S)

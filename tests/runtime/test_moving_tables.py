@@ -58,6 +58,7 @@ batch = true
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("e", [0.3, 0.5, 0.9])
 def test_ball_does_not_fall_through_a_moving_table(tmp_path: Path, e: float) -> None:
     """The ball comes to rest on the table, or is thrown up again for ever."""
@@ -75,6 +76,7 @@ def test_ball_does_not_fall_through_a_moving_table(tmp_path: Path, e: float) -> 
     assert abs(height - A[90] * np.sin(30 * t[1])) < 1e-10
 
 
+@pytest.mark.slow
 def test_ball_stays_inside_walls_with_corners_in_their_formula(tmp_path: Path) -> None:
     """Chords near the corners of the wall may be as short as rounding."""
     file = tmp_path / "stadium.toml"

@@ -41,7 +41,7 @@ def exact_sensitivity(u: Any, hold: int, steps: int, h: float) -> list[Any]:
     return [*np.moveaxis(columns, 0, -1)]
 
 
-@pytest.mark.parametrize("inputs", tiers(["signals", "held", "table"], "signals", "table"))
+@pytest.mark.parametrize("inputs", tiers(["signals", "held", "table"], "table"))
 @pytest.mark.parametrize("every", tiers([1, 3], 3))
 def test_sensitivities_equal_differences_in_many_digits(
     modules: Modules, inputs: str, every: int

@@ -234,6 +234,7 @@ def test_mechanism_does_not_stick_at_a_dead_point(modules: Modules) -> None:
     assert not run.estimate().verdict
 
 
+@pytest.mark.slow
 def test_jump_sets_the_mode_of_the_velocity_that_it_reverses(modules: Modules) -> None:
     """A thrown block rebounds from a wall: v^2 falls by 2 mu g per metre, by e^2 at the wall."""
     text = BLOCK.replace('potential = "k*x**2/2"', "").replace("start = 1.0,", "rate = 2.0,")

@@ -288,6 +288,7 @@ def test_events_have_a_time_a_state_and_a_number(tmp_path: Path) -> None:
         sweep(file, over={"y": [0.5]}, outputs=["ground"], out=tmp_path / "b.zarr")
 
 
+@pytest.mark.slow
 def test_portable_bits_are_another_build_and_another_store(
     reference: Any, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

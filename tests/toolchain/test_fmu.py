@@ -82,7 +82,7 @@ IDS = [s if "\n" not in s else s.split('"')[1] for s in SCENES_TESTED]
 
 
 @both
-@pytest.mark.parametrize("scene", tiers(SCENES_TESTED, *SCENES_TESTED[:3]), ids=IDS)
+@pytest.mark.parametrize("scene", tiers(SCENES_TESTED, BALL, FLOAT), ids=IDS)
 def test_fmu_is_valid(scene: str, version: int) -> None:
     from fmpy.validation import validate_fmu
 

@@ -120,6 +120,7 @@ def single() -> str:
     return f"{head}[[body]]{body}[[spring]]{ends}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind, coordinates", tiers((("spherical", "abc"), ("free", "abcdef")), "spherical")
 )
