@@ -46,8 +46,12 @@ static eom_status eom_begin_attempts(eom_attempt *a, eom_run_state *s, real t_en
     return EOM_OK;
 }
 
-/* a->factor = the admissible size, relative to that of the attempt, by its roughness and by the coefficient beyond its polynomial. */
-static void eom_assess_error(eom_attempt *a, const eom_run_state *s, real tol)
+/*
+ * a->factor = the admissible size, relative to that of the attempt. The size is chosen such that the roughness of
+ * the step is `aim`, sqrt(tol/2): the error of its end is the square of that of the polynomial (as Rein & Spiegel,
+ * MNRAS 446 (2015), 1424).
+ */
+static void eom_assess_error(eom_attempt *a, const eom_run_state *s, real tol, real aim)
 {
     static const real LEAST_ERROR = (real)1e-8; /* avoids a division by zero */
 #if EOM_KINKS
@@ -57,7 +61,7 @@ static void eom_assess_error(eom_attempt *a, const eom_run_state *s, real tol)
     static const real LEAST_SIZE = (real)1e-6; /* relative to t and the span: errors of shorter steps are rounding errors */
 #endif
 
-    a->factor = a->x.factor;
+    a->factor = a->x.rough > LEAST_ERROR*aim ? eom_sqrt(eom_sqrt(eom_sqrt(aim/a->x.rough))) : eom_max_factor;
     if (a->x.newton && a->outcome == EOM_CONVERGED) { /* in stiff motion the error of the end is that of the polynomial, not its square */
         const real left = a->x.beyond/((EOM_GAUSS_STAGES + 1)*tol);
         const real stiff = eom_sqrt(eom_sqrt(eom_sqrt(1/(left > LEAST_ERROR ? left : LEAST_ERROR))));
@@ -82,6 +86,7 @@ static void eom_assess_error(eom_attempt *a, const eom_run_state *s, real tol)
 static void eom_try_step(eom_attempt *a, const eom_run_state *s, real t_end, real tol, const eom_model *m, eom_output *output)
 {
     enum { S = EOM_GAUSS_STAGES };
+    const real aim = eom_sqrt(tol/2);
 #if EOM_KINKS
     const int constant = a->starts_constant;
 #else
@@ -98,9 +103,9 @@ static void eom_try_step(eom_attempt *a, const eom_run_state *s, real t_end, rea
         eom_predict_stages(&a->x.a, s, 1, a->h/s->size);
     if (a->x.newton)
         eom_factor_newton(&a->x.newton_data, a->h);
-    a->outcome = eom_solve_stages(&a->x, s->q, s->qd, s->t, a->h, tol, EOM_MAX_ROUGHNESS*eom_sqrt(tol/2), m);
+    a->outcome = eom_solve_stages(&a->x, s->q, s->qd, s->t, a->h, tol, EOM_MAX_ROUGHNESS*aim, m);
     output->evaluations += S*(a->x.sweeps > EOM_MAX_SWEEPS ? EOM_MAX_SWEEPS : a->x.sweeps);
-    eom_assess_error(a, s, tol);
+    eom_assess_error(a, s, tol, aim);
 #if EOM_KINKS
     if (a->outcome == EOM_CONVERGED && a->factor >= eom_accepted_factor)
         eom_assess_kink(a, s, tol, m, output);

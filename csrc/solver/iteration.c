@@ -125,20 +125,12 @@ static int eom_iterate(eom_gauss_stages *b, const eom_gauss_stages *a, eom_conve
     return exist;
 }
 
-/*
- * Estimate the error of a step with the accelerations a at its stages. The admissible size mostly follows from an early
- * iterate, so that the processor computes it during the later iterations.
- */
-static void eom_estimate_error(eom_solution *x, const eom_gauss_stages *a, real tol)
+/* Estimate the error of a step with the accelerations a at its stages. */
+static void eom_estimate_roughness(eom_solution *x, const eom_gauss_stages *a)
 {
     static const real FLAT = (real)0.05; /* see eom_roughness: few */
-    static const real CLOSE = (real)0.05; /* relative change of the roughness that does not count: the size is its eighth root */
-    const real rough = eom_roughness(a, x->scale, x->coarse, x->newton ? 0 : FLAT, &x->beyond);
 
-    if (!(eom_fabs(rough - x->rough) <= CLOSE*x->rough)) {
-        x->rough = rough;
-        x->factor = eom_size_factor(rough, tol);
-    }
+    x->rough = eom_roughness(a, x->scale, x->coarse, x->newton ? 0 : FLAT, &x->beyond);
 }
 
 /*
@@ -171,7 +163,6 @@ static eom_outcome eom_solve_stages(eom_solution *x, const real *q, const real *
 
     memset(&c, 0, sizeof c);
     x->rough = x->beyond = 0;
-    x->factor = eom_max_factor;
     for (x->sweeps = 1; x->sweeps <= EOM_MAX_SWEEPS; ++x->sweeps) {
         eom_gauss_stages *const swapped = from;
         int exist;
@@ -188,11 +179,11 @@ static eom_outcome eom_solve_stages(eom_solution *x, const real *q, const real *
             eom_update_best(&best, from, to, x);
 #endif
         if (ends) /* at once with the iteration: its result hardly differs */
-            eom_estimate_error(x, from, tol);
+            eom_estimate_roughness(x, from);
         if (eom_has_converged(&c, from, to, x, tol, noise))
             outcome = EOM_CONVERGED;
         if (x->sweeps == 2 || (outcome == EOM_CONVERGED && (!ends || x->beyond > 0)))
-            eom_estimate_error(x, to, tol);
+            eom_estimate_roughness(x, to);
         if (outcome == EOM_CONVERGED || (x->sweeps == 2 && x->rough > most) || eom_converges_too_slowly(&c, x, tol))
             break;
         ends = c.square*c.square*c.square <= tol/10*tol/10*c.last*c.last; /* with the same rate */
@@ -200,7 +191,7 @@ static eom_outcome eom_solve_stages(eom_solution *x, const real *q, const real *
     }
 #if EOM_CONSTRAINTS
     if (x->project && outcome != EOM_CONVERGED && best.square < best.fair*best.fair) {
-        eom_estimate_error(x, &best.a, tol);
+        eom_estimate_roughness(x, &best.a);
         outcome = EOM_CONVERGED;
         to = &best.a;
     }

@@ -97,18 +97,6 @@ static real eom_roughness(const eom_gauss_stages *a, const real *scale, const re
 }
 
 /*
- * The admissible size of a step of that roughness, relative to its size: the size whose roughness is sqrt(tol/2), because
- * the error of the end of a step is the square of that of the polynomial (as Rein & Spiegel, MNRAS 446 (2015), 1424).
- */
-static real eom_size_factor(real rough, real tol)
-{
-    static const real LEAST_ERROR = (real)1e-8; /* avoids a division by zero */
-    const real aim = eom_sqrt(tol/2);
-
-    return rough > LEAST_ERROR*aim ? eom_sqrt(eom_sqrt(eom_sqrt(aim/rough))) : eom_max_factor;
-}
-
-/*
  * s->h = the size of the first step, from the time scale of the motion. s->span = the remaining time, at most
  * EOM_LONGEST time scales of the motion, so that a distant t_end does not matter.
  */

@@ -105,7 +105,6 @@ typedef struct {
     int sweeps; /* number of iterations */
     real scale[EOM_NQ], coarse[EOM_NQ]; /* see eom_error_scales */
     real rough, beyond; /* see eom_roughness */
-    real factor; /* admissible size by the roughness, relative to that of the step */
 #if EOM_CONSTRAINTS
     int project; /* 0, or 1 + the number of rejected steps whose stages were projected onto the constraints */
 #endif

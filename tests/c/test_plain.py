@@ -142,7 +142,7 @@ def test_both_forms_have_the_same_prototypes(name: str) -> None:
 
     files, title = generated(name), assembled_system(name).name
     plain, fast = prototypes(files[f"{title}.h"]), prototypes(files[f"fast/{title}.h"])
-    assert plain == fast
+    assert plain == {p for p in fast if "_block(" not in p}  # of states in vector registers
     assert len(plain) > 8
 
 

@@ -195,6 +195,8 @@ class Driver:
     def _case(self, k: int, f: Function) -> str:
         if f.name.endswith(("_integrate", "_integrate_batch")):
             return f"    case {k}: {{\n{self._run(f)}\n        break;\n    }}"
+        if f.name.endswith("_block"):
+            return f"    case {k}: {{\n{self._block(f)}\n        break;\n    }}"
         values = [self._value(f, a) for a in f.arguments]
         results = [
             (a, name) for a, (name, _) in zip(f.arguments, values, strict=True) if self._result(a)
@@ -207,6 +209,37 @@ class Driver:
         lines += self._call(f, call, before)
         inside = "\n        ".join(lines)
         return f"    case {k}: {{\n        {inside}\n        break;\n    }}"
+
+    def _block(self, f: Function) -> str:
+        """Return the lines of a call for several states."""
+        N, step = self.N, f.name.endswith("_derivative_block")
+        NP = f"(long)(sizeof({self.n}_params)/sizeof(REAL))"
+        widths = {"q": f"{N}_NQ", "qd": f"{N}_NQ", "t": "1", "u": f"{N}_NU", "p": NP}
+        columns = {
+            "A": f"2*{N}_NQ",
+            "B": f"{N}_NU",
+            "Phi": f"2*{N}_NQ",
+            "Gamma": f"{N}_NU",
+            "E": NP,
+        }
+        widths |= {name: f"2*{N}_NQ*{width}" for name, width in columns.items()}
+        lines = ["const long count = 1 + up_to(19);"]
+        for a in f.arguments:
+            width = widths.get(a.name.removesuffix("_instance"))
+            if a.name.endswith("_instance"):
+                lines.append(f"const long a_{a.name} = byte() % 2 ? {width} : 0;")
+            elif width:
+                fill = "unwritten" if a.name in columns else "given"
+                null = "byte() % 4 == 0 ? NULL : " if a.name == "u" and not step else ""
+                lines.append(f"REAL *a_{a.name} = {null}{fill}(count*{width});")
+            elif a.name == "h":
+                lines.append("const REAL a_h = (REAL)small_number();")
+        values = ", ".join("count" if a.name == "count" else f"a_{a.name}" for a in f.arguments)
+        check = (
+            f'if (done < 0 || done > count) broken("{f.name}", "a wrong count", 0, a_q, a_q, 1);'
+        )
+        lines += [f"const long done = {f.name}({values});", check]
+        return "\n".join(f"        {line}" for line in lines)
 
     def _call(self, f: Function, call: str, before: Sequence[tuple[str, str]]) -> list[str]:
         if f.result.endswith("_status"):

@@ -98,13 +98,9 @@ def test_rounding_of_large_coordinates_costs_no_steps(far: str) -> None:
     small = build(ANCHORED.replace("FAR", "1").replace('"anchored"', '"anchored_1"'))
     large = build(ANCHORED.replace("FAR", far).replace('"anchored"', f'"anchored_{far}"'))
     for tol in (1e-6, 1e-12):
-        steps = []  # rounding errors decide the number: the median of neighbouring starts counts
-        for arm in np.linspace(0.1, 0.100001, 9):
-            small_run, large_run = (m.simulate({"arm": arm}, tol=tol) for m in (small, large))
-            assert large_run.status == "ok"
-            assert abs(large_run.q[-1, 1] - small_run.q[-1, 1]) < 10 * tol + 1e-14 * float(far)
-            steps.append(large_run.steps / small_run.steps)
-        assert np.median(steps) < 10
+        small_run, large_run = small.simulate(tol=tol), large.simulate(tol=tol)
+        assert large_run.status == "ok" and large_run.steps < 10 * small_run.steps
+        assert abs(large_run.q[-1, 1] - small_run.q[-1, 1]) < 10 * tol + 1e-14 * float(far)
 
 
 OSCILLATOR = """eomc = 1

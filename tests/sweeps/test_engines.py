@@ -259,9 +259,8 @@ def test_a_sweep_goes_on_when_a_small_file_system_has_room(scene: Path, tmp_path
     run = [sys.executable, "-c", SMALL_DISC.format(draws=SWEEP["draws"])]
     folders = [str(scene), str(tmp_path / "disc"), str(tmp_path / "a.zarr")]
     result = subprocess.run([*own, *run, *folders], capture_output=True, text=True, check=False)
-    assert re.match(r"no room left on the disc: (\d+) of 25 .* run it again \1$", result.stdout), (
-        result
-    )
+    match = re.match(r"no room left on the disc: (\d+) of 25 .* run it again (\d+)$", result.stdout)
+    assert match and int(match[1]) <= int(match[2]) < 25, result  # other workers may finish theirs
     again, whole = (
         sweep(scene, **SWEEP | {"n": 100_000}, block=4096, out=tmp_path / name)
         for name in ("a.zarr", "b.zarr")

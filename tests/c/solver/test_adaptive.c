@@ -149,17 +149,24 @@ static void test_prediction_of_step_sizes(void)
     }
 }
 
-/* The roughness is of order eight in the step size. */
+/* The error is of order eight in the step size. */
 static void test_admissible_size(void)
 {
-    const real tol = (real)1e-6;
+    const real tol = (real)1e-6, aim = eom_sqrt(tol/2);
+    eom_run_state s;
+    eom_attempt a;
 
+    memset(&s, 0, sizeof s);
+    memset(&a, 0, sizeof a);
+    a.outcome = EOM_NOT_CONVERGED;
     for (int n = 1; n < 8; n++) {
-        const real factor = eom_size_factor(eom_sqrt(tol/2)*power((real)n/2, 8), tol);
-
-        CHECK(eom_fabs(factor*(real)n/2 - 1) <= 16*EOM_EPS, factor);
+        a.x.rough = aim*power((real)n/2, 8);
+        eom_assess_error(&a, &s, tol, aim);
+        CHECK(eom_fabs(a.factor*(real)n/2 - 1) <= 16*EOM_EPS, a.factor);
     }
-    CHECK(eom_size_factor(0, tol) == 10, eom_size_factor(0, tol));
+    a.x.rough = 0;
+    eom_assess_error(&a, &s, tol, aim);
+    CHECK(a.factor == 10, a.factor);
 }
 
 /* The first step is a fraction of the time scale of the motion, or of a short run. */
