@@ -369,7 +369,7 @@ class Route:
         apply.
     linearization
         Function that returns the derivatives of the accelerations by q, qd and u, (nq, 2 nq + nu)
-        by rows, from the selected computation of the accelerations, and behind them the
+        by rows, from the selected computation of the accelerations, followed by the
         accelerations if `System.linearizes_stages`; None if the route does not apply.
     solved
         Returns a sentence for a comment that says how D qdd = tau - bias is solved, from the system

@@ -80,7 +80,7 @@ def expected(words: str, value: object) -> ValueError:
 def array(
     name: str, words: str, item: ValueType[T], least: int = 0, most: int | None = None
 ) -> ValueType[tuple[T, ...]]:
-    """Return the type of a list of `least` to `most` values of another type, kept as a tuple."""
+    """Return the type of a list of `least` to `most` values of another type, a tuple."""
     bounds = {"minItems": least} if least else {}
     bounds |= {"maxItems": most} if most else {}
 

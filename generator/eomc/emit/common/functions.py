@@ -55,7 +55,7 @@ class Linearization:
     width
         Length of one row [da/dq, da/dqd, da/du], as a C expression.
     slopes
-        The static function that computes all rows, and behind them the accelerations for the stages
+        The static function that computes all rows, followed by the accelerations for the stages
         of a step.
     size
         The number of its results, as a C expression with the enumerators NQ and WIDTH (`width`).
